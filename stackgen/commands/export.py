@@ -1,0 +1,38 @@
+"""stackgen export: from a training checkpoint to weights that can be given away."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from stackgen.commands import Command, Files
+from stackgen.runs import resolve_weights
+
+
+def main(checkpoint: Path, out: Path) -> None:
+    """Write the weights of a checkpoint as safetensors, with a JSON card beside them.
+
+    Args:
+        checkpoint: Of `stackgen fit`.
+        out: File to write, ending in .safetensors; the card gets the same name and .json.
+    """
+    from stackgen.weights import export_checkpoint
+
+    export_checkpoint(Path(resolve_weights(checkpoint)), out)
+    print(f"wrote {out}\nwrote {out.with_suffix('.json')}")
+
+
+COMMAND = Command(
+    "export",
+    main,
+    """
+    stackgen export runs/ddpm/version_0/checkpoints/last.ckpt --out ddpm.safetensors
+    stackgen export runs/ddpm --out ddpm.safetensors
+    """,
+    files=Files("checkpoint", "CHECKPOINT", "A .ckpt of `stackgen fit`, or the folder of a run."),
+)
+
+
+def run(verb: str, argv: Sequence[str]) -> int | None:
+    """Run the verb."""
+    return COMMAND.run(argv)

@@ -1,0 +1,225 @@
+"""fit, validate, test and predict: Lightning's verbs, with a folder of its own for each run."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # Lightning 2.6 calls what jsonargparse 5 drops
+os.environ.setdefault("WANDB_SILENT", "true")
+
+import torch
+import yaml
+from jsonargparse import set_parsing_settings
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.cli import ArgsType, LightningArgumentParser, LightningCLI
+from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
+
+from stackgen.commands import CONFIG_FLAGS, HelpFormatter, epilog, option_values, own_sections, parse
+from stackgen.commands.protocol import WeightsUnderTest, run_protocol, write_predictions
+from stackgen.data.datamodule import TESTSET, StackDataModule
+from stackgen.files import write_atomically
+from stackgen.models.world import CHECKPOINT_KEY
+from stackgen.runs import RUNS, config_of, last_checkpoint, new_run
+from stackgen.stack import StackgenError
+
+EXAMPLES = {
+    "fit": """
+stackgen fit --config configs/model/ddpm.yaml --data.path data/paper
+stackgen fit --config configs/model/ddpm.yaml --data.path data/paper --ckpt_path last""",
+    "validate": "stackgen validate --ckpt_path runs/ddpm/version_0/checkpoints/last.ckpt",
+    "test": "stackgen test\nstackgen test --model.weights runs/ddpm/version_0/checkpoints/last.ckpt",
+    "predict": "stackgen predict --model.weights runs/ddpm/version_0/checkpoints/last.ckpt",
+}
+
+_FOLDER = "STACKGEN_RUN_FOLDER"  # tells the other processes of a distributed run where the first one writes
+
+
+def run(verb: str, argv: Sequence[str]) -> None:
+    """Parse, build and run one of Lightning's verbs."""
+    set_parsing_settings(omegaconf_absolute_to_relative_paths=True)  # else `${...}` starts at the subcommand
+    for chatty in ("lightning.pytorch", "lightning.fabric"):  # seeds, devices and advertisements
+        logging.getLogger(chatty).setLevel(logging.WARNING)
+    interrupt = signal.getsignal(signal.SIGINT)
+    try:
+        StackgenCLI(
+            LightningModule,
+            StackDataModule,
+            subclass_mode_model=True,
+            auto_configure_optimizers=False,
+            seed_everything_default=0,
+            trainer_defaults={"default_root_dir": str(RUNS)},
+            parser_kwargs=_parser_options(),
+            args=[verb, *own_sections(verb, argv)],
+        )
+    except SystemExit as stop:  # Lightning answers Ctrl-C by exit(1)
+        if not isinstance(stop.__context__, KeyboardInterrupt):
+            raise
+        raise KeyboardInterrupt("go on with --ckpt_path last" if verb == "fit" else "") from None
+    except RuntimeError as error:
+        if "loading state_dict" not in str(error):
+            raise
+        raise StackgenError(
+            "the checkpoint does not fit the model of the configuration: give its own config.yaml"
+        ) from error
+    finally:
+        signal.signal(signal.SIGINT, interrupt)  # Lightning leaves it ignored
+
+
+class StackgenCLI(LightningCLI):
+    """Lightning's command line with run folders, `--ckpt_path last` and errors of one line."""
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        """Lightning's verbs, and which of their arguments are not options."""
+        verbs = LightningCLI.subcommands()
+        return {**verbs, "predict": verbs["predict"] | {"return_predictions"}}
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """Add what is ours: the run's name."""
+        parser.add_argument(
+            "--name",
+            type=str,
+            default="run",
+            help="Of the run; its files go to NAME/VERB_N in trainer.default_root_dir.",
+        )
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:
+        """Parse; find a checkpoint's configuration beside it, and the checkpoint that `last` means."""
+        assert isinstance(args, list)
+        verb, *rest = args
+        rest = _complete(verb, rest)
+        self.config = parse(parser, verb, [verb, *rest])
+        config = self.config[verb]
+        if config.get("model") is None:
+            raise StackgenError(f"no model: give one, e.g. stackgen {verb} --config configs/model/ddpm.yaml")
+        root = Path(config.trainer.default_root_dir)
+        if config.ckpt_path == "last":
+            config.ckpt_path = str(last_checkpoint(root / config.name))
+        elif config.ckpt_path is not None:
+            _check_checkpoint(Path(config.ckpt_path))
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """Make the run's folder, once model and data are there; keep logs and checkpoints in it."""
+        verb, config = str(self.subcommand), self._get(self.config_init, "trainer")
+        self.folder: Path | None = None
+        if not config.fast_dev_run:
+            if verb in ("fit", "validate"):
+                _ = self.datamodule.manifest  # a mistake in the path must not leave an empty run behind
+            kind = "version" if verb == "fit" else verb
+            self.folder = _run_folder(self._get(self.config, "name"), Path(config.default_root_dir), kind)
+            if config.logger in (None, True):
+                kwargs["logger"] = _loggers(self.folder, dashboard=verb == "fit")
+            if verb == "fit" and config.enable_checkpointing is not False:
+                kwargs["callbacks"] = _with_checkpoints(config.callbacks, self.folder)
+        return super().instantiate_trainer(**kwargs)
+
+    def test(self, model: LightningModule, datamodule: StackDataModule, **options: Any) -> None:
+        """The paper's protocol for weights; a training module's own test for anything else."""
+        if isinstance(model, WeightsUnderTest):
+            run_protocol(self.trainer, model, datamodule, self.folder)
+        else:
+            self.trainer.test(model, datamodule=datamodule, **options)
+            self._write_metrics()
+
+    def predict(self, model: LightningModule, datamodule: StackDataModule, **options: Any) -> None:
+        """Stacks of weights, written to files."""
+        if not isinstance(model, WeightsUnderTest):
+            raise StackgenError(
+                "predict samples with weights: leave --model out and give --ckpt_path or --model.weights"
+            )
+        self.trainer.predict(model, datamodule=datamodule, return_predictions=False, **options)
+        if self.folder is not None:
+            write_predictions(model.predictions, self.folder)
+
+    def after_validate(self) -> None:
+        """Leave the figures behind."""
+        self._write_metrics()
+
+    def _write_metrics(self) -> None:
+        if self.folder is None or not self.trainer.is_global_zero:
+            return
+        path = self.folder / "metrics.json"
+        if not path.exists():
+            metrics = {name: float(value) for name, value in self.trainer.callback_metrics.items()}
+            write_atomically(path, (json.dumps(metrics, indent=1) + "\n").encode())
+        print(f"wrote {path}")
+
+
+def _parser_options() -> dict[str, Any]:
+    """Options of the parser and of each verb's."""
+    common = {
+        "exit_on_error": False,
+        "parser_mode": "omegaconf+",
+        "allow_abbrev": False,
+        "formatter_class": HelpFormatter,
+    }
+    verbs = {verb: {**common, "epilog": epilog(example)} for verb, example in EXAMPLES.items()}
+    return {**common, "prog": "stackgen", **verbs}
+
+
+def _complete(verb: str, arguments: list[str]) -> list[str]:
+    """Fill in what goes without saying.
+
+    `test` and `predict` are about weights on the frozen test set unless a model is given; for
+    `fit` and `validate` the configuration lies beside a run's checkpoint.
+    """
+    if option_values(arguments, (*CONFIG_FLAGS, "--model")):
+        return arguments
+    checkpoints = [value for _, value in option_values(arguments, ("--ckpt_path",))]
+    if verb in ("test", "predict"):
+        weights = ["--model", f"{WeightsUnderTest.__module__}.WeightsUnderTest", "--data.path", str(TESTSET)]
+        batch = ["--data.eval_batch_size", "64"]
+        return [*weights, *batch, *(a.replace("--ckpt_path", "--model.weights", 1) for a in arguments)]
+    found = [path for path in (config_of(Path(checkpoint)) for checkpoint in checkpoints) if path]
+    if not found:
+        return arguments
+    saved = yaml.safe_load(found[-1].read_text())
+    return ["--config", yaml.safe_dump({key: saved[key] for key in ("name", "model", "data")}), *arguments]
+
+
+def _check_checkpoint(path: Path) -> None:
+    """Say in one line if a file is no checkpoint of a training; only tensors and plain values are read from it."""
+    if not path.is_file():
+        raise StackgenError(f"no checkpoint at {path}")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except Exception as error:
+        raise StackgenError(f"{path} is not a checkpoint of `stackgen fit`: {type(error).__name__}") from error
+    if not isinstance(content, dict) or CHECKPOINT_KEY not in content:
+        raise StackgenError(f"{path} is not a checkpoint of `stackgen fit`: it says nothing of its world")
+
+
+def _run_folder(name: str, root: Path, kind: str) -> Path:
+    """A new folder; in a distributed run's other processes, that of the first."""
+    if int(os.environ.get("LOCAL_RANK", 0)) and _FOLDER in os.environ:
+        return Path(os.environ[_FOLDER])
+    folder = new_run(name, root, kind)
+    os.environ[_FOLDER] = str(folder)
+    return folder
+
+
+def _loggers(folder: Path, dashboard: bool) -> list[Logger]:
+    """CSV, and for training wandb: offline unless the user has an account."""
+    csv = CSVLogger(folder.parent.parent, folder.parent.name, folder.name)
+    if not dashboard:
+        return [csv]
+    _ = csv.experiment  # before wandb puts files into its folder
+    offline = not os.environ.get("WANDB_API_KEY")
+    wandb = WandbLogger(f"{folder.parent.name}-{folder.name}", folder, project="stackgen", offline=offline)
+    getattr(wandb, "_wandb_init", {}).pop("anonymous", None)  # wandb warns about it, whatever its value
+    return [csv, wandb]
+
+
+def _with_checkpoints(callbacks: list[Callback] | None, folder: Path) -> list[Callback]:
+    """The callbacks, with one that keeps the last state if there is none that keeps any."""
+    found = list(callbacks or [])
+    if not any(isinstance(callback, ModelCheckpoint) for callback in found):
+        found.append(ModelCheckpoint(folder / "checkpoints", save_last=True, save_on_exception=True))
+    return found

@@ -1,0 +1,50 @@
+"""stackgen show: the structures of a file as a picture and as a page to turn them in."""
+
+from __future__ import annotations
+
+import webbrowser
+from collections.abc import Sequence
+from pathlib import Path
+
+from stackgen.commands import Command, Files
+from stackgen.export import write_html
+from stackgen.render import contact_sheet, save_image
+from stackgen.stacks_file import read_stacks
+
+
+def main(file: Path, out: Path | None = None, open: bool = False) -> None:
+    """Draw the structures of a stacks file: a picture, and a page that shows them in 3-D.
+
+    Args:
+        file: A stacks.json.
+        out: The picture to write, PNG or JPEG, with the page beside it as .html; by default beside the file.
+        open: Whether to open the page in a browser.
+    """
+    content = read_stacks(file)
+    picture = out or file.with_suffix(".png")
+    page = picture.with_suffix(".html")
+    verdicts = [entry.verdict for entry in content.entries]
+    ious = [entry.front_iou for entry in content.entries]
+    title = content.silhouette or file.name
+    save_image(picture, contact_sheet(content.target, content.stacks, verdicts, ious, title, content.grid))
+    write_html(page, content.stacks, verdicts, title)
+    print(f"wrote {picture}\nwrote {page}")
+    if open:
+        webbrowser.open(page.absolute().as_uri())
+
+
+COMMAND = Command(
+    "show",
+    main,
+    """
+    stackgen show out/arch/stacks.json --open
+    stackgen show mine.json --out pictures/mine.png
+    """,
+    files=Files("file", "FILE", "A stacks.json."),
+    flags={"open": "Open the page in a browser."},
+)
+
+
+def run(verb: str, argv: Sequence[str]) -> int | None:
+    """Run the verb."""
+    return COMMAND.run(argv)

@@ -1,0 +1,45 @@
+"""Verdicts as a table in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from rich.table import Table
+
+from stackgen.protocols import Verdict
+from stackgen.stack import Stack
+from stackgen.stacks_file import Entry
+
+
+def verdict_table(source: str) -> Table:
+    """An empty table; `source` heads the column that says where a stack came from."""
+    table = Table(source, "stack", "verdict", "front IoU", "what fell", box=None, pad_edge=False)
+    for column in table.columns[1:2] + table.columns[3:4]:
+        column.justify = "right"
+    return table
+
+
+def add_entries(table: Table, source: str, entries: Iterable[Entry]) -> None:
+    """One row for each stack, numbered from 1; blocks are numbered from 0, as in the file and the picture."""
+    for number, entry in enumerate(entries, 1):
+        stands = entry.verdict is not None and entry.verdict.stable
+        table.add_row(
+            source if number == 1 else "",
+            str(number),
+            "[green]stands[/]" if stands else "[red]falls[/]",
+            "" if entry.front_iou is None else f"{entry.front_iou:.2f}",
+            describe_fall(entry.stack, entry.verdict) if entry.verdict else "",
+        )
+
+
+def describe_fall(stack: Stack, verdict: Verdict) -> str:
+    """Which blocks fell and how far, the furthest first; empty where none did.
+
+    >>> stack = Stack([0, 3], [[0, 0, 0.5, 0, 0, 0], [2, 0, 3.5, 0, 0, 0]])
+    >>> describe_fall(stack, Verdict(False, np.array([False, True]), np.array([0.0, 3.0]), stack))
+    'block 1 (triangle) 3.0 cells'
+    """
+    fallen = np.flatnonzero(verdict.fell)
+    order = fallen[np.argsort(-verdict.drop[fallen], kind="stable")]
+    return ", ".join(f"block {i} ({stack.names[i]}) {verdict.drop[i]:.1f} cells" for i in order)

@@ -1,0 +1,262 @@
+"""The dataset generator: templates in, shards out, on as many processes as there are.
+
+A shard holds all stacks of a fixed range of templates, and each template has its own random stream,
+so a shard's bytes depend on the settings and its number alone: not on the number of workers, nor on
+whether the run was interrupted. Shards appear under their final name only when complete; a run that
+is started again goes on with those that are missing.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stackgen.data.generation.deconstruction import Judge, deconstruct
+from stackgen.data.generation.templates import Template, TemplateSettings, draw_template, realize
+from stackgen.data.shards import Manifest, Sample, Split, read_shard, write_shard
+from stackgen.files import write_atomically
+from stackgen.geometry import PAPER_GRID, Grid, silhouette
+from stackgen.sim.physics import Physics
+from stackgen.sim.verdict import AcceptLimits
+from stackgen.sim.world import Simulator
+from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, StackgenError
+
+TESTSET = Path(__file__).resolve().parents[2] / "assets" / "testset-v1"
+_GOLDEN = 0.6180339887498949
+
+
+@dataclass(frozen=True)
+class GenerateSettings:
+    """A dataset, described; `configs/generate/*.yaml` hold these.
+
+    Args:
+        name: Of the dataset, kept in its manifest.
+        stacks: Stop once this many are stored.
+        seed: Same seed, same dataset.
+        templates_per_shard: All stacks of so many templates share a shard and a split.
+        validation, test: Shares of the templates that go to these splits; 1 - both is for training.
+        draw: Keep only so many of the stacks, drawn uniformly; 0 keeps all.
+        max_removals: Blocks taken out of a template, at most.
+        max_blocks: Stacks of more blocks are not stored, but still deconstructed.
+        settle_twice: A stack must stand again when simulated from its settled poses.
+        exclude_testset: Leave out every template that `testset-v1` uses, and its mirror image.
+        template: How designs are drawn.
+        accept: When a settled stack is good enough.
+        physics: Of the simulator.
+        grid: Design grid and silhouette scale.
+        catalogue: The shapes.
+    """
+
+    name: str
+    stacks: int
+    seed: int = 0
+    templates_per_shard: int = 250
+    validation: float = 0.02
+    test: float = 0.10
+    draw: int = 0
+    max_removals: int = 4
+    max_blocks: int = MAX_BLOCKS
+    settle_twice: bool = False
+    exclude_testset: bool = True
+    template: TemplateSettings = field(default_factory=TemplateSettings)
+    accept: AcceptLimits = field(default_factory=AcceptLimits)
+    physics: Physics = field(default_factory=Physics)
+    grid: Grid = PAPER_GRID
+    catalogue: Catalogue = PAPER_CATALOGUE
+
+    def __post_init__(self) -> None:
+        if self.stacks < 1 or self.templates_per_shard < 1 or self.max_blocks < 1 or self.max_removals < 0:
+            raise StackgenError("generate: stacks, templates_per_shard and max_blocks must be at least 1, max_removals 0")
+        if self.validation < 0 or self.test < 0 or self.validation + self.test > 1:
+            raise StackgenError("generate: validation and test are shares of the templates; their sum is at most 1")
+        if not 0 <= self.draw <= self.stacks:
+            raise StackgenError(f"generate: draw must lie in 0..stacks, got {self.draw}")
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain form without what the manifest stores elsewhere."""
+        plain = asdict(replace(self, catalogue=PAPER_CATALOGUE))
+        for key in ("name", "seed", "grid", "catalogue", "physics", "max_blocks"):
+            plain.pop(key)
+        return json.loads(json.dumps(plain))
+
+    def split_of(self, shard: int) -> Split:
+        """The split of a shard; shares are met evenly along the way (multiples of the golden ratio)."""
+        place = shard * _GOLDEN % 1
+        if place < self.validation:
+            return "validation"
+        return "test" if place < self.validation + self.test else "train"
+
+
+def generate(
+    settings: GenerateSettings,
+    out: Path,
+    workers: int | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Manifest:
+    """Make a dataset, or finish one that was interrupted.
+
+    Args:
+        settings: What to make.
+        out: Its folder.
+        workers: Processes; by default one per core. The result does not depend on it.
+        progress: Called with the number of stacks stored so far.
+
+    Raises:
+        StackgenError: If the folder holds something else.
+    """
+    excluded = frozenset(testset_layouts(settings.catalogue, settings.grid)) if settings.exclude_testset else frozenset()
+    _claim(out, settings)
+    entries: list[dict[str, Any]] = []
+    stored = 0
+    for entry in _shards_in_order(settings, out, excluded, workers or os.cpu_count() or 1):
+        entries.append(entry)
+        stored += entry["samples"]
+        if progress:
+            progress(min(stored, settings.stacks))
+        if stored >= settings.stacks:
+            break
+    entries[-1] = _trim(out, entries[-1], entries[-1]["samples"] - (stored - settings.stacks))
+    if settings.draw:
+        entries = _draw(out, entries, settings)
+    manifest = _manifest(settings, tuple(entry for entry in entries if entry["samples"]))
+    manifest.save(out)
+    known = {entry["file"] for entry in manifest.shards}
+    for path in out.glob("*.tar"):
+        if path.name not in known:
+            path.unlink()
+    return manifest
+
+
+def testset_layouts(catalogue: Catalogue, grid: Grid) -> set[str]:
+    """Layouts of the templates that `testset-v1` was made from, and their mirror images."""
+    if not (TESTSET / "dataset.json").exists():
+        return set()
+    manifest = Manifest.load(TESTSET)
+    layouts: set[str] = set()
+    for path in manifest.paths(TESTSET, "test"):
+        for sample in read_shard(path):
+            template = Template.from_key(sample.meta["layout"])
+            layouts |= {template.key, template.mirrored(manifest.catalogue, manifest.grid).key}
+    return layouts
+
+
+def template_samples(settings: GenerateSettings, number: int, excluded: frozenset[str], simulator: Simulator) -> list[Sample]:
+    """All stacks that one template gives, or none."""
+    rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
+    template = draw_template(rng, settings.template, settings.catalogue, settings.grid)
+    if template.key in excluded:
+        return []
+    start = realize(template, rng, settings.template, settings.catalogue, settings.grid)
+    judge = Judge(simulator, settings.accept, settings.settle_twice)
+    samples = []
+    for removed, stack in deconstruct(start, judge, settings.max_removals):
+        if len(stack) > settings.max_blocks:
+            continue
+        poses = stack.poses.astype(np.float32)
+        picture = silhouette(stack.with_poses(poses), "front", settings.grid)
+        key = f"{number:08d}-{'.'.join(f'{b:02d}' for b in removed) or 'whole'}".replace(".", "_")
+        meta = {"template": number, "layout": template.key, "removed": list(removed)}
+        samples.append(Sample(key, stack.shapes.astype(np.uint8), poses, picture, meta))
+    return samples
+
+
+def _make_shard(settings: GenerateSettings, out: Path, shard: int, excluded: frozenset[str]) -> dict[str, Any]:
+    """Write one shard, unless it is there; returns its manifest entry."""
+    path = out / f"{settings.split_of(shard)}-{shard:06d}.tar"
+    first = shard * settings.templates_per_shard
+    if path.exists():
+        return _entry(path)
+    simulator = _simulator(settings.physics, settings.catalogue)
+    samples = [
+        sample
+        for number in range(first, first + settings.templates_per_shard)
+        for sample in template_samples(settings, number, excluded, simulator)
+    ]
+    return write_shard(path, samples)
+
+
+@functools.cache
+def _simulator(physics: Physics, catalogue: Catalogue) -> Simulator:
+    """One simulator a worker process: its worlds take seconds to build."""
+    return Simulator(physics, catalogue)
+
+
+def _entry(path: Path) -> dict[str, Any]:
+    return write_shard(path, list(read_shard(path)))
+
+
+def _shards_in_order(
+    settings: GenerateSettings, out: Path, excluded: frozenset[str], workers: int
+) -> Iterator[dict[str, Any]]:
+    """Manifest entries of shard 0, 1, 2, ..., made ahead by a pool of processes."""
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(workers, mp_context=context)
+    waiting: dict[int, Future[dict[str, Any]]] = {}
+    ahead = 0
+    shard = 0
+    try:
+        while True:
+            while len(waiting) < 2 * workers:
+                waiting[ahead] = pool.submit(_make_shard, settings, out, ahead, excluded)
+                ahead += 1
+            while not waiting[shard].done():
+                wait([waiting[shard]], timeout=1, return_when=FIRST_COMPLETED)
+            yield waiting.pop(shard).result()
+            shard += 1
+    finally:
+        for process in list(getattr(pool, "_processes", {}).values()):
+            process.terminate()
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _manifest(settings: GenerateSettings, entries: tuple[dict[str, Any], ...]) -> Manifest:
+    return Manifest(
+        settings.name,
+        settings.seed,
+        settings.catalogue,
+        settings.grid,
+        settings.max_blocks,
+        settings.physics.to_json(),
+        settings.to_json(),
+        entries,
+    )
+
+
+def _claim(out: Path, settings: GenerateSettings) -> None:
+    """Make the folder this dataset's own, or see that it already is."""
+    mine = json.dumps(_manifest(settings, ()).to_json(), sort_keys=True, indent=1)
+    claim = out / "generate.json"
+    out.mkdir(parents=True, exist_ok=True)
+    if claim.exists():
+        if claim.read_text() != mine:
+            raise StackgenError(f"{out} holds a dataset made with other settings; choose another folder or delete it")
+    elif any(out.glob("*.tar")):
+        raise StackgenError(f"{out} holds shards, but no generate.json that says of what; choose another folder")
+    else:
+        write_atomically(claim, mine.encode())
+
+
+def _trim(out: Path, entry: dict[str, Any], keep: int) -> dict[str, Any]:
+    """Cut a shard to its first samples."""
+    if keep >= entry["samples"]:
+        return entry
+    path = out / entry["file"]
+    return write_shard(path, list(read_shard(path))[:keep])
+
+
+def _draw(out: Path, entries: list[dict[str, Any]], settings: GenerateSettings) -> list[dict[str, Any]]:
+    """Keep `settings.draw` stacks of all, drawn uniformly, in one shard."""
+    samples = [sample for entry in entries for sample in read_shard(out / entry["file"])]
+    rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(2**32,)))
+    chosen = np.sort(rng.choice(len(samples), settings.draw, replace=False))
+    path = out / entries[0]["file"]
+    return [write_shard(path, [samples[i] for i in chosen])]

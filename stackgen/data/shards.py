@@ -1,0 +1,206 @@
+"""Shards: stacks in WebDataset tars, a manifest beside them.
+
+A dataset is a folder with `dataset.json` and `<split>-<number>.tar`. A sample is four members that
+share a key and that numpy reads: `.shapes.npy` uint8 (k,), `.poses.npy` float32 (k, 6),
+`.silhouette.npy` uint8 (H, W/8) (the front silhouette, `np.packbits` along the rows) and
+`.meta.json`. Nothing in a shard depends on when or where it was written: equal stacks, equal bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import tarfile
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stackgen.files import write_atomically
+from stackgen.geometry import Grid, Mask
+from stackgen.stack import Catalogue, Stack, StackgenError
+
+FORMAT = "stackgen.dataset/1"
+Split = Literal["train", "validation", "test"]
+SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One stack of a dataset.
+
+    Args:
+        key: Unique in its dataset: template number and the blocks removed from it.
+        shapes: (k,) indices into the catalogue.
+        poses: (k, 6) [cell, rad], float32.
+        silhouette: (H, W) front silhouette.
+        meta: `template` (number), `layout` (its design as text), `removed` (block numbers).
+    """
+
+    key: str
+    shapes: NDArray[np.uint8]
+    poses: NDArray[np.float32]
+    silhouette: Mask
+    meta: dict[str, Any]
+
+    def stack(self, catalogue: Catalogue) -> Stack:
+        """The sample as a stack of a catalogue."""
+        return Stack(self.shapes.astype(np.int64), self.poses.astype(np.float64), catalogue)
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What `dataset.json` says of a dataset.
+
+    Args:
+        name: Of the configuration that made it.
+        seed: Of the generator.
+        catalogue, grid: The world of its stacks.
+        max_blocks: N, the longest block list stored.
+        physics: `Physics.to_json()` of the simulator that made it.
+        settings: The generator's other settings.
+        shards: For each file its name, SHA-256 and number of samples.
+    """
+
+    name: str
+    seed: int
+    catalogue: Catalogue
+    grid: Grid
+    max_blocks: int
+    physics: dict[str, Any]
+    settings: dict[str, Any]
+    shards: tuple[dict[str, Any], ...] = field(default=())
+
+    def count(self, split: Split) -> int:
+        """Number of samples of a split."""
+        return sum(shard["samples"] for shard in self.shards if shard["split"] == split)
+
+    def paths(self, folder: Path, split: Split) -> list[Path]:
+        """The shards of a split, in order."""
+        return [folder / shard["file"] for shard in self.shards if shard["split"] == split]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain form, as stored."""
+        return {
+            "format": FORMAT,
+            "name": self.name,
+            "seed": self.seed,
+            "catalogue": self.catalogue.to_json(),
+            "grid": vars(self.grid),
+            "max_blocks": self.max_blocks,
+            "physics": self.physics,
+            "settings": self.settings,
+            "counts": {split: self.count(split) for split in SPLITS},
+            "shards": list(self.shards),
+        }
+
+    @property
+    def sha256(self) -> str:
+        """Hash of the whole manifest, and so of the dataset: it names every shard's own."""
+        return manifest_sha256(self.to_json())
+
+    def save(self, folder: Path) -> None:
+        """Write `dataset.json`, whole or not at all."""
+        write_atomically(folder / "dataset.json", (json.dumps(self.to_json(), indent=1) + "\n").encode())
+
+    @staticmethod
+    def load(folder: str | Path) -> Manifest:
+        """Read a dataset's manifest.
+
+        Raises:
+            StackgenError: If there is none, or it is not one of ours.
+        """
+        path = Path(folder) / "dataset.json"
+        try:
+            data = json.loads(path.read_text())
+        except FileNotFoundError as error:
+            raise StackgenError(f"no dataset at {folder}: there is no dataset.json in it; make one with `stackgen generate`") from error
+        except (OSError, ValueError) as error:
+            raise StackgenError(f"{path} is not readable as JSON: {error}") from error
+        if not isinstance(data, dict) or data.get("format") != FORMAT:
+            raise StackgenError(f"{path} is not a {FORMAT} manifest")
+        try:
+            return Manifest(
+                data["name"],
+                data["seed"],
+                Catalogue.from_json(data["catalogue"]),
+                Grid(**data["grid"]),
+                data["max_blocks"],
+                data["physics"],
+                data["settings"],
+                tuple(data["shards"]),
+            )
+        except (KeyError, TypeError) as error:
+            raise StackgenError(f"{path} is damaged: {error!r}") from error
+
+
+def manifest_sha256(manifest: Mapping[str, Any]) -> str:
+    """Hash of a manifest in its plain form."""
+    return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
+
+
+def write_shard(path: Path, samples: Iterable[Sample]) -> dict[str, Any]:
+    """Write one tar; returns its manifest entry (file, split, samples, sha256)."""
+    buffer, count = io.BytesIO(), 0
+    with tarfile.open(fileobj=buffer, mode="w", format=tarfile.USTAR_FORMAT) as tar:
+        for sample in samples:
+            count += 1
+            for suffix, content in _members(sample):
+                info = tarfile.TarInfo(f"{sample.key}.{suffix}")
+                info.size = len(content)
+                tar.addfile(info, io.BytesIO(content))
+    content = buffer.getvalue()
+    write_atomically(path, content)
+    split = path.name.rpartition("-")[0]
+    return {"file": path.name, "split": split, "samples": count, "sha256": hashlib.sha256(content).hexdigest()}
+
+
+def read_shard(path: str | Path) -> Iterator[Sample]:
+    """The samples of one tar, in order.
+
+    Raises:
+        StackgenError: If the file is missing, truncated or not a shard.
+    """
+    members: dict[str, bytes] = {}
+    try:
+        with tarfile.open(path, mode="r:") as tar:
+            for member in tar:
+                key, _, suffix = member.name.partition(".")
+                file = tar.extractfile(member)
+                if file is None:
+                    continue
+                members[suffix] = file.read()
+                if len(members) == 4:
+                    yield decode_sample(key, members)
+                    members = {}
+    except (OSError, tarfile.TarError, KeyError, ValueError, EOFError) as error:
+        raise StackgenError(f"shard {path} is missing or damaged: {error}") from error
+    if members:
+        raise StackgenError(f"shard {path} ends in the middle of a sample")
+
+
+def decode_sample(key: str, members: dict[str, bytes]) -> Sample:
+    """A sample from the contents of its members, by suffix."""
+    arrays = {
+        name: np.load(io.BytesIO(members[f"{name}.npy"]), allow_pickle=False)
+        for name in ("shapes", "poses", "silhouette")
+    }
+    picture = np.unpackbits(arrays["silhouette"], axis=1).astype(bool)
+    return Sample(key, arrays["shapes"], arrays["poses"], picture, json.loads(members["meta.json"]))
+
+
+def _members(sample: Sample) -> Iterator[tuple[str, bytes]]:
+    yield "meta.json", json.dumps(sample.meta, sort_keys=True).encode()
+    yield "poses.npy", _npy(sample.poses.astype("<f4"))
+    yield "shapes.npy", _npy(sample.shapes.astype(np.uint8))
+    yield "silhouette.npy", _npy(np.packbits(sample.silhouette, axis=1))
+
+
+def _npy(array: NDArray[Any]) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, array, allow_pickle=False)
+    return buffer.getvalue()

@@ -1,0 +1,153 @@
+"""Poses, vertices, silhouettes and IoU: pure functions of numpy arrays.
+
+Legend: k blocks, V vertices, H x W pixels. Lengths in cells, rotation vectors in radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+from stackgen.stack import Stack
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+View = Literal["front", "side", "top"]
+VIEWS: tuple[View, ...] = ("front", "side", "top")
+
+_AXES: dict[View, tuple[int, int]] = {"front": (0, 2), "side": (1, 2), "top": (0, 1)}
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The design grid and the scale of its pictures.
+
+    The image is `image_size` pixels square. x = 0 (y = 0 in the side view) lies on the edge between
+    its two middle columns, z = 0 on the edge `ground_margin` pixels above its lower border; the top
+    view has y = 0 between its two middle rows. At 14 pixels a cell a structure may stick out 0.28
+    cells on every side of the 4 x 4 grid before it is cut off: twice what displacement and settling
+    were seen to do.
+
+    Args:
+        width, height: Size of the design grid [cell].
+        image_size: Edge of the silhouette [pixel].
+        pixels_per_cell: Scale.
+        ground_margin: Rows of pixels under the ground line.
+    """
+
+    width: int = 4
+    height: int = 4
+    image_size: int = 64
+    pixels_per_cell: float = 14.0
+    ground_margin: float = 4.0
+
+    def horizontal(self, margin: int = 0) -> Floats:
+        """World coordinate of each column's centre [cell], with `margin` extra pixels on both sides."""
+        columns = np.arange(-margin, self.image_size + margin) + 0.5
+        return (columns - self.image_size / 2) / self.pixels_per_cell
+
+    def vertical(self, view: View, margin: int = 0) -> Floats:
+        """World coordinate of each row's centre [cell], first row at the top of the picture."""
+        rows = np.arange(-margin, self.image_size + margin) + 0.5
+        zero = self.image_size / 2 if view == "top" else self.image_size - self.ground_margin
+        return (zero - rows) / self.pixels_per_cell
+
+
+PAPER_GRID = Grid()
+
+
+def rotation_matrices(rotation_vectors: ArrayLike) -> Floats:
+    """(..., 3) rotation vectors [rad] to (..., 3, 3) block_to_world rotations."""
+    vectors = np.asarray(rotation_vectors, dtype=np.float64)
+    return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
+
+
+def rotation_vectors(matrices: ArrayLike) -> Floats:
+    """(..., 3, 3) rotations to (..., 3) rotation vectors [rad], of angle at most pi."""
+    array = np.asarray(matrices, dtype=np.float64)
+    return Rotation.from_matrix(array.reshape(-1, 3, 3)).as_rotvec().reshape(array.shape[:-1])
+
+
+def tilt(poses: ArrayLike) -> Floats:
+    """(..., 6) poses to the angle (...) [rad] between each block's z axis and the vertical."""
+    up = rotation_matrices(np.asarray(poses)[..., 3:])[..., 2, 2]
+    return np.arccos(np.clip(up, -1, 1))
+
+
+def centers_of_mass(stack: Stack) -> Floats:
+    """(k, 3) centres of mass in the world [cell]."""
+    offsets = np.array([stack.catalogue[s].center_of_mass for s in stack.shapes]).reshape(-1, 3)
+    return stack.poses[:, :3] + np.einsum("kij,kj->ki", rotation_matrices(stack.poses[:, 3:]), offsets)
+
+
+def block_vertices(stack: Stack) -> list[Floats]:
+    """Corners (V, 3) of each block in the world [cell]."""
+    rotations = rotation_matrices(stack.poses[:, 3:])
+    return [
+        stack.catalogue[shape].vertices @ rotation.T + pose[:3]
+        for shape, rotation, pose in zip(stack.shapes, rotations, stack.poses, strict=True)
+    ]
+
+
+def mirror(stack: Stack) -> Stack:
+    """Reflection at the plane x = 0: again a stack, for shapes whose outline is symmetric.
+
+    >>> mirror(Stack([0], [[1, 0, 0.5, 0, 0.1, 0.2]])).poses.tolist()
+    [[-1.0, 0.0, 0.5, 0.0, -0.1, -0.2]]
+    """
+    return stack.with_poses(stack.poses * np.array([-1, 1, 1, 1, -1, -1]) + 0.0)
+
+
+def silhouette(stack: Stack, view: View = "front", grid: Grid = PAPER_GRID, margin: int = 0) -> Mask:
+    """Orthographic silhouette (H, W): a pixel is set when its centre is covered by a block.
+
+    Front shows (x, z), side (y, z), top (x, y), the second axis upwards. `margin` adds pixels on all
+    four sides. A convex block covers, in each row of pixels, the interval between the leftmost and
+    the rightmost crossing of the segments that join its projected corners.
+    """
+    rows, columns = grid.vertical(view, margin), grid.horizontal(margin)
+    picture = np.zeros((len(rows), len(columns)), dtype=bool)
+    for corners in block_vertices(stack):
+        left, right = _row_intervals(corners[:, _AXES[view]], rows)
+        picture |= (columns >= left[:, None]) & (columns <= right[:, None])
+    return picture
+
+
+def _row_intervals(points: Floats, rows: Floats) -> tuple[Floats, Floats]:
+    """Where the convex hull of `points` (V, 2) crosses each row: leftmost and rightmost, (H,) each.
+
+    Rows that miss it get the empty interval (inf, -inf).
+    """
+    i, j = np.triu_indices(len(points), 1)
+    low, high = points[i], points[j]
+    swap = low[:, 1] > high[:, 1]
+    low, high = np.where(swap[:, None], high, low), np.where(swap[:, None], low, high)
+    rise = high[:, 1] - low[:, 1]
+    crosses = (low[:, 1] <= rows[:, None]) & (rows[:, None] < high[:, 1])  # (H, pairs); flat segments never cross
+    fraction = (rows[:, None] - low[:, 1]) / np.where(rise == 0, 1, rise)
+    x = low[:, 0] + fraction * (high[:, 0] - low[:, 0])
+    return np.where(crosses, x, np.inf).min(axis=1), np.where(crosses, x, -np.inf).max(axis=1)
+
+
+def iou(a: Mask, b: Mask) -> float:
+    """Intersection over union of two masks of one size; 1 when both are empty.
+
+    >>> iou(np.array([[True, True, False]]), np.array([[False, True, True]]))
+    0.3333333333333333
+    """
+    union = np.count_nonzero(a | b)
+    return np.count_nonzero(a & b) / union if union else 1.0
+
+
+def silhouette_iou(stack: Stack, target: Mask, view: View = "front", grid: Grid = PAPER_GRID) -> float:
+    """IoU of a stack's silhouette with a target (H, W); what is off the canvas counts as outside the target."""
+    margin = grid.image_size
+    limit = (grid.image_size / 2 + margin) / grid.pixels_per_cell - 2
+    near = stack.poses.copy()
+    near[:, :3] = np.clip(near[:, :3], -limit, limit)  # a block further out is still counted as outside
+    picture = silhouette(stack.with_poses(near), view, grid, margin)
+    return iou(picture, np.pad(np.asarray(target, dtype=bool), margin))

@@ -1,0 +1,95 @@
+"""Training the diffusion model: a thin Lightning shell around PoseDiffusion."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from stackgen._lightning import pl
+from stackgen.models.denoiser import DenoiserConfig
+from stackgen.models.diffusion import DiffusionConfig, DiffusionSampler, PoseDiffusion
+from stackgen.models.optimization import OptimizerConfig, configure_optimizer
+from stackgen.models.schedules import ScheduleConfig
+from stackgen.models.world import WorldMixin
+
+
+class DDPM(WorldMixin, pl.LightningModule):
+    """StackGen's denoising diffusion model (paper, "Method"); the defaults are the paper's.
+
+    Args:
+        denoiser: Architecture.
+        schedule: Noise schedule.
+        diffusion: Target and normalisation.
+        optimizer: Learning rate and its course.
+        draws: Noise draws of each sample in a training step.
+    """
+
+    kind = "ddpm"
+
+    def __init__(
+        self,
+        denoiser: DenoiserConfig = DenoiserConfig(),  # noqa: B008 - frozen
+        schedule: ScheduleConfig = ScheduleConfig(),  # noqa: B008
+        diffusion: DiffusionConfig = DiffusionConfig(),  # noqa: B008
+        optimizer: OptimizerConfig = OptimizerConfig(),  # noqa: B008
+        draws: int = 1,
+    ) -> None:
+        super().__init__()
+        self.config: dict[str, Any] = {
+            "denoiser": asdict(denoiser),
+            "schedule": asdict(schedule),
+            "diffusion": asdict(diffusion),
+        }
+        self.optimizer_config = optimizer
+        self.draws = draws
+        self._parts = (denoiser, schedule, diffusion)
+        self.model: PoseDiffusion
+
+    def build(self) -> None:
+        """Make the network once its world is known."""
+        if not hasattr(self, "model"):
+            self.model = PoseDiffusion(*self._parts, len(self.catalogue), self.grid.image_size, self.max_blocks)
+
+    def setup(self, stage: str) -> None:
+        """Build the network and take the normalisation from the training data; a checkpoint's comes later."""
+        super().setup(stage)
+        data = getattr(self.trainer, "datamodule", None)
+        if data is not None and stage == "fit":
+            self.model.fit_normalization(*data.pose_statistics())
+
+    def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
+        """One step of Eq. 3's loss, logged by quarter of the steps too."""
+        losses, t = self.model.loss(batch, self.draws)
+        loss = losses.mean()
+        self.log("train/loss", loss, prog_bar=True)
+        if self.trainer.global_step % self.trainer.log_every_n_steps == 0:
+            self._log_quarters("train", losses.detach(), t)
+        return loss
+
+    def validation_step(self, batch: dict[str, Tensor], index: int) -> None:
+        """The same loss on held-out stacks, with the same noise every time."""
+        generator = torch.Generator(device=batch["poses"].device).manual_seed(index)
+        losses, t = self.model.loss(batch, 1, generator)
+        self.log("validation/loss", losses.mean(), prog_bar=True, batch_size=len(losses), sync_dist=True)
+        self._log_quarters("validation", losses, t)
+
+    def _log_quarters(self, stage: str, losses: Tensor, t: Tensor) -> None:
+        quarter = (t - 1) * 4 // self.model.schedule.steps
+        for q in range(4):
+            if (quarter == q).any():
+                part = losses[quarter == q]
+                self.log(f"{stage}/loss_t{q + 1}of4", part.mean(), batch_size=len(part), sync_dist=stage != "train")
+
+    def configure_optimizers(self) -> Any:
+        """AdamW and its learning-rate course."""
+        return configure_optimizer(self, self.optimizer_config)
+
+    def sampler(self) -> DiffusionSampler:
+        """The model as a StackSampler, sharing its weights."""
+        was_training = self.model.training
+        sampler = DiffusionSampler(self.model, self.catalogue, self.grid, self.max_blocks)
+        self.model.train(was_training)
+        return sampler

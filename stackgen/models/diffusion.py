@@ -1,0 +1,205 @@
+"""Diffusion over block poses: normalisation, training target and sampling, without any training framework."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor, nn
+
+from stackgen.geometry import PAPER_GRID, Grid, Mask
+from stackgen.models.denoiser import POSE, Denoiser, DenoiserConfig, raster_order
+from stackgen.models.samplers import ancestral
+from stackgen.models.schedules import Schedule, ScheduleConfig
+from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Stack, StackgenError, shapes_of
+
+
+@dataclass(frozen=True)
+class DiffusionConfig:
+    """What is diffused and what the network estimates.
+
+    Args:
+        prediction: `epsilon`, the noise (paper), or `v` (Salimans & Ho 2022), which weights the
+            noisy steps, where the layout is decided, more.
+        clip: Bound of the clean estimate while sampling, in standard deviations; null for none.
+        least_std: Lower bound of the standard deviation that a dimension is divided by [cell, rad].
+            Settled stacks hardly vary in y and in rotation; without a bound the rare slanted block
+            would be hundreds of standard deviations away.
+    """
+
+    prediction: Literal["epsilon", "v"] = "epsilon"
+    clip: float | None = None
+    least_std: float = 0.0
+
+
+class PoseDiffusion(nn.Module):
+    """The denoiser with its schedule and the normalisation of poses.
+
+    Args:
+        denoiser, schedule, diffusion: Their descriptions.
+        num_shapes: Size of the catalogue.
+        image_size: Edge of the silhouette [pixel].
+        max_blocks: N.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        denoiser: DenoiserConfig,
+        schedule: ScheduleConfig,
+        diffusion: DiffusionConfig,
+        num_shapes: int = 4,
+        image_size: int = 64,
+        max_blocks: int = MAX_BLOCKS,
+    ) -> None:
+        super().__init__()
+        self.config = diffusion
+        self.schedule = Schedule(schedule)
+        self.denoiser = Denoiser(denoiser, num_shapes, image_size, max_blocks)
+        self.register_buffer("mean", torch.zeros(POSE))
+        self.register_buffer("std", torch.ones(POSE))
+
+    def fit_normalization(self, mean: ArrayLike, std: ArrayLike) -> None:
+        """Take over the training poses' statistics (6,) [cell, rad]."""
+        self.mean.copy_(torch.as_tensor(np.asarray(mean)))
+        self.std.copy_(torch.as_tensor(np.asarray(std)).clamp(min=max(self.config.least_std, 1e-6)))
+
+    def loss(self, batch: dict[str, Tensor], draws: int = 1, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """Mean squared error per sample and draw, averaged over its real blocks (paper, Eq. 3).
+
+        Args:
+            batch: As the DataModule makes it.
+            draws: Noise draws of every sample; they share one look at the silhouette.
+            generator: Of steps and noise; the global one by default.
+
+        Returns:
+            Losses and their steps t, both (B * draws,).
+        """
+        poses, shapes, mask = batch["poses"], batch["shapes"], batch["mask"]
+        if self.denoiser.config.ordered:
+            order = raster_order(poses, shapes)
+            poses = poses.gather(1, order[..., None].expand_as(poses))
+            shapes, mask = shapes.gather(1, order), mask.gather(1, order)
+        clean = ((poses - self.mean) / self.std).repeat_interleave(draws, 0)
+        mask, shapes = mask.repeat_interleave(draws, 0), shapes.repeat_interleave(draws, 0)
+        t = torch.randint(1, self.schedule.steps + 1, (len(clean),), generator=generator, device=clean.device)
+        noise = torch.randn(clean.shape, generator=generator, device=clean.device, dtype=clean.dtype)
+        noisy = self.schedule.diffuse(clean, noise, t)
+        estimate = self.denoiser(noisy, t, shapes, mask, self.denoiser.encode(batch["silhouette"]))
+        target = noise if self.config.prediction == "epsilon" else self._velocity(clean, noise, t)
+        error = (estimate - target).square().mean(-1) * mask
+        return error.sum(-1) / mask.sum(-1), t
+
+    def _velocity(self, clean: Tensor, noise: Tensor, t: Tensor) -> Tensor:
+        signal, sigma = self.schedule.signal_and_noise(t)
+        return signal * noise - sigma * clean
+
+    @torch.inference_mode()
+    def sample(
+        self,
+        silhouettes: Tensor,
+        shapes: Tensor,
+        mask: Tensor,
+        generator: torch.Generator,
+        callback: Callable[[int, Tensor], None] | None = None,
+    ) -> Tensor:
+        """Poses (B, N, 6) [cell, rad] for silhouettes (B / n, H, W), each serving n rows of shapes (B, N)."""
+        memory = self.denoiser.encode(silhouettes)
+
+        def predict(x: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+            estimate = self.denoiser(x, t, shapes, mask, memory)
+            signal, sigma = self.schedule.signal_and_noise(t)
+            if self.config.prediction == "v":
+                return signal * x - sigma * estimate, sigma * x + signal * estimate
+            return (x - sigma * estimate) / signal, estimate
+
+        shown = None if callback is None else (lambda t, x: callback(t, x * self.std + self.mean))
+        noise = torch.randn((*shapes.shape, POSE), generator=generator, device=generator.device)
+        x = ancestral(predict, noise.to(shapes.device), self.schedule, generator, self.config.clip, shown)
+        return x * self.std + self.mean
+
+
+class DiffusionSampler:
+    """A StackSampler: the diffusion model with its world.
+
+    Args:
+        model: Trained.
+        catalogue, grid, max_blocks: The world it was trained in.
+        card: What is known about the weights.
+        batch: Stacks denoised together, at most.
+    """
+
+    def __init__(
+        self,
+        model: PoseDiffusion,
+        catalogue: Catalogue = PAPER_CATALOGUE,
+        grid: Grid = PAPER_GRID,
+        max_blocks: int = MAX_BLOCKS,
+        card: dict[str, Any] | None = None,
+        batch: int = 512,
+    ) -> None:
+        self.model = model.eval()
+        self.catalogue, self.grid, self.max_blocks = catalogue, grid, max_blocks
+        self.card = card or {}
+        self.batch = batch
+
+    def sample_batch(
+        self,
+        silhouettes: Mask,
+        counts: NDArray[np.int64],
+        num_samples: int,
+        seed: int,
+        callback: Callable[[int, NDArray[np.float64]], None] | None = None,
+    ) -> list[list[Stack]]:
+        """See StackSampler; `callback` gets (t, poses (B * num_samples, N, 6)) as the noise goes away.
+
+        Raises:
+            StackgenError: If a block list is empty or longer than the model takes, or sizes differ.
+        """
+        size = self.grid.image_size
+        if silhouettes.ndim != 3 or silhouettes.shape[1:] != (size, size) or len(counts) != len(silhouettes):
+            raise StackgenError(f"sampling needs silhouettes (B, {size}, {size}) and as many block lists")
+        totals = np.asarray(counts).sum(axis=1)
+        if len(totals) and not (totals.min() >= 1 and totals.max() <= self.max_blocks):
+            raise StackgenError(f"this model takes 1 to {self.max_blocks} blocks, got {sorted(set(totals.tolist()))}")
+        stacks: list[list[Stack]] = []
+        scenes = max(1, self.batch // num_samples)
+        device = self.model.mean.device
+        generator = torch.Generator().manual_seed(seed)
+        for start in range(0, len(counts), scenes):
+            part = slice(start, start + scenes)
+            shapes, mask = pad_shapes(counts[part], int(totals[part].max()) if self._trims else self.max_blocks)
+            shown = None if callback is None else (lambda t, x: callback(t, x.double().cpu().numpy()))
+            poses = self.model.sample(
+                torch.from_numpy(np.ascontiguousarray(silhouettes[part], dtype=np.float32)).to(device),
+                torch.from_numpy(np.repeat(shapes, num_samples, axis=0)).to(device),
+                torch.from_numpy(np.repeat(mask, num_samples, axis=0)).to(device),
+                generator,
+                shown,
+            )
+            found = poses.double().cpu().numpy().reshape(len(shapes), num_samples, -1, POSE)
+            for scene, row in enumerate(found):
+                kinds = shapes[scene][mask[scene]]
+                stacks.append([Stack(kinds, p[: len(kinds)], self.catalogue) for p in row])
+        return stacks
+
+    @property
+    def _trims(self) -> bool:
+        """Whether padding may be left out: not where the network was trained to see it."""
+        config = self.model.denoiser.config
+        return config.conditioning == "cross" or config.mask_padding
+
+
+def pad_shapes(counts: NDArray[np.int64], length: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Block lists (B, S) as shape indices (B, length), padded with -1, and the mask of real blocks."""
+    rows = [shapes_of(row) for row in counts]
+    shapes = np.full((len(rows), length), -1, dtype=np.int64)
+    for i, row in enumerate(rows):
+        shapes[i, : len(row)] = row
+    return shapes, shapes >= 0

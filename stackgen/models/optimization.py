@@ -1,0 +1,56 @@
+"""AdamW with a warm-up and a cosine: one recipe for everything that learns here."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from stackgen._lightning import pl
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """Of AdamW. The paper gives none of these; they are ours.
+
+    Args:
+        learning_rate: At its peak.
+        warmup: Steps of linear rise.
+        final: Share of the peak that the cosine ends at, when training ends.
+        weight_decay: Decoupled, on matrices only.
+        beta2: Decay of the second moment.
+    """
+
+    learning_rate: float = 1e-3
+    warmup: int = 200
+    final: float = 0.01
+    weight_decay: float = 0.01
+    beta2: float = 0.99
+
+
+def configure_optimizer(module: pl.LightningModule, config: OptimizerConfig) -> dict[str, Any]:
+    """AdamW for a module's parameters; the cosine spans the trainer's estimated steps."""
+    parameters = [p for p in module.parameters() if p.requires_grad]
+    groups = [
+        {"params": [p for p in parameters if p.ndim >= 2], "weight_decay": config.weight_decay},
+        {"params": [p for p in parameters if p.ndim < 2], "weight_decay": 0.0},
+    ]
+    optimizer = torch.optim.AdamW(groups, lr=config.learning_rate, betas=(0.9, config.beta2))
+    total = max(1, int(module.trainer.estimated_stepping_batches))
+    course = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: learning_rate_share(step, total, config))
+    return {"optimizer": optimizer, "lr_scheduler": {"scheduler": course, "interval": "step"}}
+
+
+def learning_rate_share(step: int, total: int, config: OptimizerConfig) -> float:
+    """Share of the peak learning rate at a step.
+
+    >>> config = OptimizerConfig(warmup=10, final=0.1)
+    >>> [round(learning_rate_share(s, 110, config), 3) for s in (0, 9, 10, 60, 110)]
+    [0.1, 1.0, 1.0, 0.55, 0.1]
+    """
+    if step < config.warmup:
+        return (step + 1) / config.warmup
+    progress = min(1.0, (step - config.warmup) / max(1, total - config.warmup))
+    return config.final + (1 - config.final) * 0.5 * (1 + math.cos(math.pi * progress))

@@ -1,0 +1,65 @@
+"""Noise schedules: how much of the signal is left after t steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class ScheduleConfig:
+    """A noise schedule, described.
+
+    Args:
+        steps: T.
+        kind: `linear` in beta, as the paper has it, or `cosine` (Nichol & Dhariwal 2021).
+        beta_start, beta_end: Ends of the linear schedule (paper: 1e-4 and 0.189).
+    """
+
+    steps: int = 50
+    kind: Literal["linear", "cosine"] = "linear"
+    beta_start: float = 1e-4
+    beta_end: float = 0.189
+
+
+class Schedule:
+    """The numbers of a schedule, indexed by t = 1..T; index 0 is the clean end (alpha-bar 1).
+
+    >>> Schedule(ScheduleConfig()).alpha_bar[50].sqrt().item()  # what is left of the signal at T
+    0.0804...
+    """
+
+    def __init__(self, config: ScheduleConfig) -> None:
+        self.config = config
+        t = torch.linspace(0, 1, config.steps + 1, dtype=torch.float64)
+        if config.kind == "linear":
+            beta = torch.linspace(config.beta_start, config.beta_end, config.steps, dtype=torch.float64)
+        else:
+            curve = torch.cos((t + 0.008) / 1.008 * torch.pi / 2) ** 2
+            beta = (1 - curve[1:] / curve[:-1]).clamp(max=0.999)
+        self.beta = torch.cat([torch.zeros(1, dtype=torch.float64), beta])
+        self.alpha = 1 - self.beta
+        self.alpha_bar = self.alpha.cumprod(0)
+        self._signal = self.alpha_bar.sqrt().float()
+        self._noise = (1 - self.alpha_bar).sqrt().float()
+
+    @property
+    def steps(self) -> int:
+        """T."""
+        return self.config.steps
+
+    def signal_and_noise(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """sqrt(alpha-bar) and sqrt(1 - alpha-bar) at steps t (...), float32, shaped (..., 1, 1)."""
+        index = t.cpu()
+        return (
+            self._signal[index].to(t.device)[..., None, None],
+            self._noise[index].to(t.device)[..., None, None],
+        )
+
+    def diffuse(self, clean: Tensor, noise: Tensor, t: Tensor) -> Tensor:
+        """Forward process (paper, Eq. 1): clean and noise (B, N, D), t (B,)."""
+        signal, sigma = self.signal_and_noise(t)
+        return signal * clean + sigma * noise

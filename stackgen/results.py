@@ -1,0 +1,205 @@
+"""What an evaluation found: rows of the table, and the files they are kept in."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from stackgen.files import write_atomically
+from stackgen.geometry import VIEWS
+from stackgen.metrics import SCENE_METRICS, SceneScore
+from stackgen.statistics import Estimate, clustered_ratio
+
+TRUE_LIST, PREDICTED_LIST = "ground truth", "predicted"
+
+TOP = 3
+"""How many block lists a predictor is asked for; the first is built from, the rest count for top 3."""
+
+PAPER_ROWS = {
+    TRUE_LIST: {"stability": 84.20, "diversity": 66.87, "front_iou": 74.39, "avg_iou": 71.31},
+    PREDICTED_LIST: {"stability": 85.20, "diversity": 64.53, "front_iou": 75.08, "avg_iou": 71.84},
+}
+"""StackGen in the paper's table [%], from its own data and physics."""
+
+HEADINGS = {
+    "stability": "stability",
+    "diversity": "diversity",
+    "front_iou": "front IoU",
+    "avg_iou": "avg IoU",
+    "valid_diversity": "valid div.",
+    "iou_given_stable": "IoU | stable",
+    "front_iou_before_physics": "front IoU before",
+}
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """What became of the samples of one scene.
+
+    Args:
+        name: Of the scene.
+        counts: (S,) block list that was asked for.
+        score: Of its samples.
+        fell: For each sample the numbers of the blocks that fell.
+        drop: For each sample how far the block that sank most did [cell].
+        list_rank: Place of the true list among the predicted ones, from 0; None if it was given.
+        feasible: Whether the predicted list can make the silhouette; None if it was given.
+    """
+
+    name: str
+    counts: tuple[int, ...]
+    score: SceneScore
+    fell: tuple[tuple[int, ...], ...]
+    drop: tuple[float, ...]
+    list_rank: int | None = None
+    feasible: bool | None = None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A row of the table, down to its samples.
+
+    Args:
+        method: Name of who sampled.
+        block_list: `ground truth` or `predicted`.
+        scenes: Results, in the order of the scenes.
+        num_samples: A scene.
+        seed: Of the sampler.
+        physics: Numbers the verdicts hold for, if the checker told them.
+        facts: What else the reader should know (weights, dataset), as JSON allows.
+    """
+
+    method: str
+    block_list: str
+    scenes: tuple[SceneResult, ...]
+    num_samples: int
+    seed: int
+    physics: dict[str, Any] | None = None
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    def estimate(self, metric: str) -> Estimate | None:
+        """A metric of :data:`stackgen.metrics.SCENE_METRICS` with its 95 % interval, clustered by scene."""
+        parts = [SCENE_METRICS[metric](scene.score) for scene in self.scenes]
+        return clustered_ratio([p[0] for p in parts], [p[1] for p in parts])
+
+    def list_estimates(self) -> dict[str, Estimate | None]:
+        """The predictor's own metrics; empty where the true list was given."""
+        predicted = [s for s in self.scenes if s.list_rank is not None]
+        if not predicted:
+            return {}
+        hits = {
+            "exact_match": [s.list_rank == 0 for s in predicted],
+            f"top{TOP}": [s.list_rank is not None and s.list_rank < TOP for s in predicted],
+            "feasible": [bool(s.feasible) for s in predicted],
+        }
+        return {name: clustered_ratio(hit, np.ones(len(hit))) for name, hit in hits.items()}
+
+    def summary(self) -> dict[str, Any]:
+        """What `metrics.json` holds: shares in [0, 1], null where a metric does not exist."""
+        values = {name: self.estimate(name) for name in SCENE_METRICS}
+        lists = self.list_estimates()
+        return {
+            **self.facts,
+            "format": "stackgen.metrics/1",
+            "method": self.method,
+            "block_list": self.block_list,
+            "scenes": len(self.scenes),
+            "samples": sum(len(s.score.samples) for s in self.scenes),
+            "samples_per_scene": self.num_samples,
+            "seed": self.seed,
+            "physics": self.physics,
+            "interval": "95 %, cluster bootstrap over scenes",
+            "metrics": {name: value and value.to_json() for name, value in values.items()},
+            "block_lists": {name: value and value.to_json() for name, value in lists.items()} or None,
+        }
+
+
+def write_metrics(path: str | Path, evaluation: Evaluation) -> None:
+    """Write the summary as `metrics.json`.
+
+    Raises:
+        StackgenError: If it cannot be written.
+    """
+    text = json.dumps(evaluation.summary(), indent=1, allow_nan=False)
+    write_atomically(path, (text + "\n").encode())
+
+
+def write_scenes(path: str | Path, evaluation: Evaluation) -> None:
+    """Write one line of CSV for each sample of each scene; empty where a figure does not exist.
+
+    Raises:
+        StackgenError: If it cannot be written.
+    """
+    rows = [row for scene in evaluation.scenes for row in _sample_rows(scene)]
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, rows[0].keys(), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_atomically(path, buffer.getvalue().encode())
+
+
+def _sample_rows(scene: SceneResult) -> Iterator[dict[str, Any]]:
+    for number, (score, fell, drop) in enumerate(zip(scene.score.samples, scene.fell, scene.drop, strict=True)):
+        yield {
+            "scene": scene.name,
+            "sample": number,
+            "block_list": " ".join(map(str, scene.counts)),
+            "stable": int(score.stable),
+            **{f"{view}_iou": score.ious.get(view, "") for view in VIEWS},
+            "avg_iou": score.average_iou,
+            "front_iou_before_physics": score.front_iou_before,
+            "valid": int(score.valid),
+            "fell": " ".join(map(str, fell)),
+            "max_drop_cells": drop,
+            "layout": "/".join(" ".join(map(str, row)) for row in score.layout),
+            "true_list_rank": "" if scene.list_rank is None else scene.list_rank,
+            "list_feasible": "" if scene.feasible is None else int(scene.feasible),
+        }
+
+
+def format_table(rows: Sequence[Evaluation]) -> Table:
+    """The rows as a table for the terminal, in percent, the paper's own below them."""
+    table = Table(
+        title="Mean and 95 % interval, clustered by scene [%]",
+        caption="The paper's figures come from its own data and physics.",
+    )
+    for heading in ("method", "block list", "scenes x samples"):
+        table.add_column(heading)
+    for heading in HEADINGS.values():
+        table.add_column(heading, justify="right")
+    for row in rows:
+        size = f"{len(row.scenes)} x {row.num_samples}"
+        table.add_row(row.method, row.block_list, size, *(_percent(row.estimate(name)) for name in HEADINGS))
+    table.add_section()
+    for source, figures in PAPER_ROWS.items():
+        cells = [f"{figures[name]:.2f}" if name in figures else "" for name in HEADINGS]
+        table.add_row("StackGen, paper", source, "500 x 3", *cells, style="dim")
+    return table
+
+
+def format_list_table(rows: Sequence[Evaluation]) -> Table | None:
+    """The block-list predictor's own metrics, in percent; None if no row has one."""
+    predicted = [(row, row.list_estimates()) for row in rows if row.list_estimates()]
+    if not predicted:
+        return None
+    table = Table(title="Block lists [%]")
+    table.add_column("method")
+    for heading in ("exact match", f"top {TOP}", "can make the silhouette"):
+        table.add_column(heading, justify="right")
+    for row, estimates in predicted:
+        table.add_row(row.method, *(_percent(estimate) for estimate in estimates.values()))
+    return table
+
+
+def _percent(estimate: Estimate | None) -> str:
+    if estimate is None:
+        return "-"
+    return f"{100 * estimate.value:.2f} ({100 * estimate.low:.1f}-{100 * estimate.high:.1f})"

@@ -1,0 +1,176 @@
+"""What several tests share: a model that needs no weights, and command lines that answer as data."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from stackgen.api import Model
+from stackgen.cli import main
+from stackgen.geometry import Mask
+from stackgen.stack import Stack, shapes_of
+
+
+class Answer(NamedTuple):
+    """What a command line answered."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def line(self) -> str:
+        """The one line on stderr; a test that asks for it fails if there are more, or none."""
+        lines = self.err.splitlines()
+        assert len(lines) == 1, f"one line expected on stderr, got:\n{self.err}"
+        return lines[0]
+
+
+Cli = Callable[..., Answer]
+
+CHILD = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[1])}
+"""Environment of a command line in a process of its own, wherever that runs."""
+
+
+@pytest.fixture
+def cli(capsys: pytest.CaptureFixture[str]) -> Cli:
+    """Run a command line in this process."""
+
+    def run(*arguments: object) -> Answer:
+        capsys.readouterr()
+        code = main([str(argument) for argument in arguments])
+        out, err = capsys.readouterr()
+        assert "Traceback" not in err, err
+        return Answer(code, out, err)
+
+    return run
+
+
+class TowerSampler:
+    """Puts the blocks on top of each other, each a little to one side as the seed says."""
+
+    def sample_batch(
+        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
+    ) -> list[list[Stack]]:
+        """Towers, whatever the silhouettes."""
+        rng = np.random.default_rng(seed)
+        return [[self._tower(list_, rng) for _ in range(num_samples)] for list_ in counts]
+
+    @staticmethod
+    def _tower(counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
+        shapes = shapes_of(counts)
+        poses = np.zeros((len(shapes), 6))
+        poses[:, 0] = rng.uniform(-0.05, 0.05, len(shapes))
+        poses[:, 2] = np.arange(len(shapes)) + 0.5
+        return Stack(shapes, poses)
+
+
+class ThreeCubes:
+    """Predicts three cubes, whatever the silhouette."""
+
+    def predict(self, silhouettes: Mask, top: int = 1) -> NDArray[np.int64]:
+        """(B, top, S) block lists."""
+        return np.tile(np.array([3, 0, 0, 0]), (len(silhouettes), top, 1))
+
+
+@pytest.fixture
+def towers(monkeypatch: pytest.MonkeyPatch) -> Model:
+    """A model that needs no weights; `stackgen sample` uses it while the test runs."""
+    model = Model(TowerSampler(), ThreeCubes())
+    monkeypatch.setattr("stackgen.commands.sample.load", lambda *names: model)
+    return model
+
+
+class TinyWeights(NamedTuple):
+    """Untrained weights of both networks."""
+
+    sampler: Path
+    predictor: Path
+
+    @property
+    def options(self) -> list[str]:
+        """As the command line takes them."""
+        return ["--weights", str(self.sampler), "--block_list_weights", str(self.predictor)]
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> TinyWeights:
+    """Files of networks that nobody trained, small enough to be fast."""
+    import torch
+
+    from stackgen.models.blocklist import CNNConfig
+    from stackgen.models.cnn import BlockListCNN
+    from stackgen.models.ddpm import DDPM
+    from stackgen.models.denoiser import DenoiserConfig
+    from stackgen.weights import write_weights
+
+    folder = tmp_path_factory.mktemp("weights")
+    torch.manual_seed(0)
+    ddpm = DDPM(DenoiserConfig(width=32, layers=1, heads=2, feedforward=64))
+    cnn = BlockListCNN(CNNConfig(channels=8, layers=1, stem_stride=4, pool=8, hidden=16))
+    for name, module in (("ddpm", ddpm), ("cnn", cnn)):
+        module.build()
+        write_weights(folder / f"{name}.safetensors", module.model.state_dict(), module.card())
+    return TinyWeights(folder / "ddpm.safetensors", folder / "cnn.safetensors")
+
+
+def draw_tower(path: Path, width: int = 40, height: int = 120) -> Path:
+    """Write a picture of a tower, dark on light."""
+    from PIL import Image
+
+    picture = np.full((160, 120), 255, dtype=np.uint8)
+    picture[150 - height : 150, 60 - width // 2 : 60 + width // 2] = 0
+    Image.fromarray(picture).save(path)
+    return path
+
+
+@pytest.fixture
+def tower_image(tmp_path: Path) -> Path:
+    """A picture of a tower."""
+    return draw_tower(tmp_path / "tower.png")
+
+
+def stacks_json(*stacks: list[tuple[str, float, float]]) -> dict[str, Any]:
+    """The plain form of stacks of (shape, x, z)."""
+    blocks = [[{"shape": name, "position": [x, 0, z]} for name, x, z in stack] for stack in stacks]
+    return {"format": "stackgen.stacks/1", "stacks": [{"blocks": b} for b in blocks]}
+
+
+@pytest.fixture
+def stands(tmp_path: Path) -> Path:
+    """A file of one stack that stands."""
+    path = tmp_path / "stands.json"
+    path.write_text(json.dumps(stacks_json([("cube", 0, 0.5), ("triangle", 0, 1.5)])))
+    return path
+
+
+@pytest.fixture(scope="session")
+def towers_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of towers of one to three cubes: 48 to train on, 12 to validate, 12 to test."""
+    from stackgen.data.shards import Manifest, Sample, write_shard
+    from stackgen.geometry import PAPER_GRID, silhouette
+    from stackgen.sim.physics import Physics
+    from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE
+
+    folder = tmp_path_factory.mktemp("dataset")
+    rng = np.random.default_rng(0)
+    entries = []
+    for number, (split, size) in enumerate((("train", 48), ("validation", 12), ("test", 12))):
+        samples = []
+        for i in range(size):
+            stack = TowerSampler._tower(np.array([1 + i % 3, 0, 0, 0]), rng)
+            poses = stack.poses.astype(np.float32)
+            meta = {"template": 100 * number + i, "layout": "", "removed": []}
+            picture = silhouette(stack.with_poses(poses))
+            samples.append(Sample(f"{number}{i:04d}", stack.shapes.astype(np.uint8), poses, picture, meta))
+        entries.append(write_shard(folder / f"{split}-{number:06d}.tar", samples))
+    physics = Physics().to_json()
+    Manifest("towers", 0, PAPER_CATALOGUE, PAPER_GRID, MAX_BLOCKS, physics, {}, tuple(entries)).save(folder)
+    return folder

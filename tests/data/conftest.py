@@ -1,0 +1,51 @@
+"""A small dataset in every form it can have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stackgen.data.arrays import StackArrays, load_dataset
+from stackgen.data.generation.templates import draw_template, realize
+from stackgen.data.shards import Manifest, Sample, write_shard
+from stackgen.geometry import PAPER_GRID, silhouette
+from stackgen.stack import PAPER_CATALOGUE
+
+SHARDS = {"train-000000.tar": 41, "train-000001.tar": 30, "validation-000002.tar": 23, "test-000003.tar": 7}
+
+
+@pytest.fixture(scope="session")
+def samples() -> dict[str, list[Sample]]:
+    """Designs as drawn, by the name of their shard; a template each."""
+    rng = np.random.default_rng(0)
+    made: dict[str, list[Sample]] = {}
+    number = 0
+    for name, count in SHARDS.items():
+        made[name] = []
+        while len(made[name]) < count:
+            design = draw_template(rng)
+            stack = realize(design, rng)
+            if len(stack) > 10:
+                continue
+            meta = {"template": number, "layout": design.key, "removed": []}
+            shapes, poses = stack.shapes.astype(np.uint8), stack.poses.astype(np.float32)
+            made[name].append(Sample(f"{number:07d}", shapes, poses, silhouette(stack), meta))
+            number += 1
+    return made
+
+
+@pytest.fixture(scope="session")
+def dataset(samples: dict[str, list[Sample]], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset folder."""
+    folder = tmp_path_factory.mktemp("dataset")
+    shards = tuple(write_shard(folder / name, those) for name, those in samples.items())
+    Manifest("small", 0, PAPER_CATALOGUE, PAPER_GRID, 10, {"engine": "none"}, {}, shards).save(folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def splits(dataset: Path) -> dict[str, StackArrays]:
+    """Its splits in memory."""
+    return load_dataset(dataset)[0]
