@@ -39,7 +39,7 @@ class StartFrom(pl.Callback):
 
         tensors, _ = read_weights(self.weights)
         try:
-            pl_module.model.load_state_dict(tensors)  # type: ignore[operator, union-attr]
+            pl_module.model.load_state_dict(tensors)  # type: ignore[union-attr]
         except RuntimeError as error:
             raise StackgenError(f"StartFrom: {self.weights} does not fit the model of the configuration") from error
 

@@ -47,12 +47,12 @@ class Grid:
 
     def horizontal(self, margin: int = 0) -> Floats:
         """World coordinate of each column's centre [cell], with `margin` extra pixels on both sides."""
-        columns = np.arange(-margin, self.image_size + margin) + 0.5
+        columns = np.arange(-margin, self.image_size + margin, dtype=np.float64) + 0.5
         return (columns - self.image_size / 2) / self.pixels_per_cell
 
     def vertical(self, view: View, margin: int = 0) -> Floats:
         """World coordinate of each row's centre [cell], first row at the top of the picture."""
-        rows = np.arange(-margin, self.image_size + margin) + 0.5
+        rows = np.arange(-margin, self.image_size + margin, dtype=np.float64) + 0.5
         zero = self.image_size / 2 if view == "top" else self.image_size - self.ground_margin
         return (zero - rows) / self.pixels_per_cell
 
@@ -146,8 +146,10 @@ def iou(a: Mask, b: Mask) -> float:
 def silhouette_iou(stack: Stack, target: Mask, view: View = "front", grid: Grid = PAPER_GRID) -> float:
     """IoU of a stack's silhouette with a target (H, W); what is off the canvas counts as outside the target."""
     margin = grid.image_size
-    limit = (grid.image_size / 2 + margin) / grid.pixels_per_cell - 2
+    half = (grid.image_size / 2 + margin) / grid.pixels_per_cell - 2
+    middle = (grid.image_size / 2 - grid.ground_margin) / grid.pixels_per_cell  # height of the picture's centre
     near = stack.poses.copy()
-    near[:, :3] = np.clip(near[:, :3], -limit, limit)  # a block further out is still counted as outside
+    near[:, :2] = np.clip(near[:, :2], -half, half)  # a block further out is still counted as outside
+    near[:, 2] = np.clip(near[:, 2], middle - half, middle + half)
     picture = silhouette(stack.with_poses(near), view, grid, margin)
     return iou(picture, np.pad(np.asarray(target, dtype=bool), margin))

@@ -52,13 +52,15 @@ class Shape:
         if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
             raise StackgenError(f"shape {self.name!r}: the outline must be at least three (x, z) corners")
         edges = np.roll(corners, -1, axis=0) - corners
-        turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(edges[:, 0], -1)
-        if (turns <= 0).any():
+        after = np.roll(edges, -1, axis=0)
+        turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
+        around = np.arctan2(turns, (edges * after).sum(axis=1)).sum()  # a star turns left too, but more than once
+        if (turns <= 0).any() or abs(around - 2 * np.pi) > 1e-6:
             raise StackgenError(f"shape {self.name!r}: the outline must be convex and counter-clockwise")
         if np.abs(corners.min(axis=0) + corners.max(axis=0)).max() > 1e-6:
             raise StackgenError(f"shape {self.name!r}: the outline's box must be centred on (0, 0)")
-        if not self.depth > 0:
-            raise StackgenError(f"shape {self.name!r}: depth must be positive, got {self.depth}")
+        if not 0 < self.depth < np.inf:
+            raise StackgenError(f"shape {self.name!r}: depth must be positive and finite, got {self.depth}")
 
     @cached_property
     def size(self) -> tuple[float, float, float]:
@@ -162,7 +164,9 @@ class Catalogue:
         try:
             return Catalogue(
                 tuple(
-                    Shape(str(i["name"]), tuple((float(x), float(z)) for x, z in i["outline"]), float(i.get("depth", 1)))
+                    Shape(
+                        str(i["name"]), tuple((float(x), float(z)) for x, z in i["outline"]), float(i.get("depth", 1))
+                    )
                     for i in items
                 )
             )
@@ -230,7 +234,9 @@ class Stack:
         return Stack(self.shapes, np.asarray(poses, dtype=np.float64), self.catalogue)
 
 
-def parse_block_list(text: str, catalogue: Catalogue = PAPER_CATALOGUE, max_blocks: int = MAX_BLOCKS) -> NDArray[np.int64]:
+def parse_block_list(
+    text: str, catalogue: Catalogue = PAPER_CATALOGUE, max_blocks: int = MAX_BLOCKS
+) -> NDArray[np.int64]:
     """Counts (S,) from `"cube=3,rectangle=2"`.
 
     Raises:
@@ -244,8 +250,8 @@ def parse_block_list(text: str, catalogue: Catalogue = PAPER_CATALOGUE, max_bloc
     for part in filter(None, (p.strip() for p in text.split(","))):
         name, equals, number = (p.strip() for p in part.partition("="))
         index = catalogue.index(name)
-        if not equals or not number.isascii() or not number.isdigit():
-            raise StackgenError(f"block list: {part!r} should read {name}=COUNT with a whole number of at least 0")
+        if not equals or not number.isascii() or not number.isdigit() or len(number) > 9:
+            raise StackgenError(f"block list: {part!r} should read {name}=COUNT, a whole number from 0 to {max_blocks}")
         counts[index] += int(number)
     check_block_list(counts, max_blocks)
     return counts

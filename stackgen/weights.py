@@ -10,6 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import pickle
+import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -35,6 +37,11 @@ DEFAULTS = {"sampler": "ddpm-small", "predictor": "blocklist-small"}
 
 _CHECKPOINT_CARD = "stackgen"  # stackgen.models.world.CHECKPOINT_KEY, which this module must not import Lightning for
 _PREFIX = "model."  # of the network inside a LightningModule
+_DAMAGED = (
+    *(zipfile.BadZipFile, zlib.error, pickle.UnpicklingError),
+    *(RuntimeError, EOFError, LookupError, ValueError, NotImplementedError),
+)
+"""What zipfile and torch raise at files that are not as they were written."""
 
 
 def load_sampler(weights: str | Path = "default") -> StackSampler:
@@ -127,16 +134,20 @@ def export_checkpoint(checkpoint: Path, out: Path, metrics: dict[str, Any] | Non
 
 def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     try:
+        with zipfile.ZipFile(path) as archive:  # torch checks no checksums
+            if archive.testzip() is not None:
+                raise zipfile.BadZipFile
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
-        card = checkpoint[_CHECKPOINT_CARD]
-        tensors = {k.removeprefix(_PREFIX): v for k, v in checkpoint["state_dict"].items() if k.startswith(_PREFIX)}
     except OSError as error:
         raise StackgenError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (pickle.UnpicklingError, RuntimeError, EOFError) as error:
+    except _DAMAGED as error:
         raise StackgenError(f"{path} is not a checkpoint of stackgen, or is damaged") from error
-    except (KeyError, TypeError, AttributeError) as error:
-        raise StackgenError(f"{path} is a checkpoint, but not one of stackgen's models") from error
-    trained = {"steps": checkpoint.get("global_step"), "epochs": checkpoint.get("epoch")}
+    parts = checkpoint if isinstance(checkpoint, dict) else {}
+    card, state = parts.get(_CHECKPOINT_CARD), parts.get("state_dict")
+    if not isinstance(card, dict) or not isinstance(state, dict):
+        raise StackgenError(f"{path} is a checkpoint, but not one of stackgen's models")
+    tensors = {k.removeprefix(_PREFIX): v for k, v in state.items() if k.startswith(_PREFIX)}
+    trained = {"steps": parts.get("global_step"), "epochs": parts.get("epoch")}
     return tensors, {**card, "trained": trained}
 
 
@@ -147,7 +158,9 @@ def _read_bytes(path: Path) -> bytes:
         raise StackgenError(f"{path} cannot be read: {error.strerror}") from error
 
 
-def _build(weights: str | Path, card: dict[str, Any], tensors: dict[str, Tensor], makers: dict[str, Any], what: str) -> Any:
+def _build(
+    weights: str | Path, card: dict[str, Any], tensors: dict[str, Tensor], makers: dict[str, Any], what: str
+) -> Any:
     if card.get("kind") not in makers:
         raise StackgenError(f"{weights} holds weights of kind {card.get('kind')!r}, not of a {what}")
     try:

@@ -9,6 +9,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+import yaml
 
 import stackgen
 from stackgen.cli import VERBS
@@ -54,9 +55,7 @@ def test_ci_runs_the_tests() -> None:
 
 
 @pytest.mark.parametrize("line", [line for line in commands() + examples() if line.startswith("stackgen ")])
-def test_every_command_line_parses(
-    line: str, cli: Cli, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
-) -> None:
+def test_every_command_line_parses(line: str, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     _, verb, *arguments = shlex.split(line)
     assert verb in VERBS
@@ -65,6 +64,21 @@ def test_every_command_line_parses(
             assert Path(argument).exists(), f"{line}: there is no {argument}"
     answer = cli(verb, *arguments, "--print_config")  # parses everything, runs nothing
     assert answer.code == 0, answer.err
+
+
+CONFIGS = sorted((ROOT / "configs").rglob("*.yaml"))
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_config_parses(path: Path, cli: Cli) -> None:
+    """Those of a folder with its verb; those with a section for each verb with all of these."""
+    sections = [verb for verb in VERBS if verb in (yaml.safe_load(path.read_text()) or {})]
+    verbs = {"generate": ["generate"], "model": ["fit"], "data": []}.get(path.parent.name, sections)
+    for verb in verbs:
+        # What a command line must add to the file; what the file has already may be given twice.
+        more = {"fit": ["--data.path", "x"], "generate": ["--out", "x"], "sample": ["a.png", "--out", "x"]}
+        answer = cli(verb, "--config", path, *more.get(verb, []), "--print_config")
+        assert answer.code == 0, answer.err
 
 
 def test_a_wrong_option_would_be_noticed(cli: Cli) -> None:

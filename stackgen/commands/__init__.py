@@ -11,6 +11,7 @@ from pathlib import Path
 
 import yaml
 from jsonargparse import ArgumentError, ArgumentParser, DefaultHelpFormatter, Namespace
+from omegaconf.errors import OmegaConfBaseException
 
 from stackgen.stack import StackgenError
 
@@ -113,7 +114,7 @@ def parse(parser: ArgumentParser, verb: str, argv: Sequence[str]) -> Namespace:
     """
     try:
         return parser.parse_args(list(argv))
-    except ArgumentError as error:
+    except (ArgumentError, OmegaConfBaseException) as error:
         raise StackgenError(
             f"{_shorten(str(error))}{_hint(parser, str(error))}; see `stackgen {verb} --help`"
         ) from error
@@ -168,12 +169,12 @@ _NOISE = re.compile(
 def _shorten(message: str, limit: int = 300) -> str:
     """The gist of jsonargparse's paragraphs, as one line.
 
-    >>> _shorten('Parser key "model":\\n  Errors:\\n    - Expected a <class \'int\'>\\n    - Expected a path but x')
-    'model: Expected a int'
+    >>> _shorten("Parser key 'data.mode':\\n  Errors:\\n  - Expected a float. Got value: q\\n  - Expected a path but q")
+    'data.mode: Expected a float. Got value: q'
     """
     lines = [line.strip() for line in message.splitlines() if line.strip() and not _NOISE.match(line.strip())]
     text = " ".join(line.removeprefix("- ") for line in lines)
-    text = re.sub(r'^Parser key "(.*?)"', r"\1", re.sub(r"<class '([\w.]+)'>", r"\1", text))
+    text = re.sub(r"""^Parser key ["'](.*?)["']""", r"\1", re.sub(r"<class '([\w.]+)'>", r"\1", text))
     return text if len(text) <= limit else f"{text[:limit].rstrip()} ..."
 
 

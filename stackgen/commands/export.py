@@ -26,8 +26,8 @@ COMMAND = Command(
     "export",
     main,
     """
-    stackgen export runs/ddpm/version_0/checkpoints/last.ckpt --out ddpm.safetensors
-    stackgen export runs/ddpm --out ddpm.safetensors
+    stackgen export runs/ddpm-small/version_0/checkpoints/last.ckpt --out ddpm-small.safetensors
+    stackgen export runs/ddpm-small --out ddpm-small.safetensors
     """,
     files=Files("checkpoint", "CHECKPOINT", "A .ckpt of `stackgen fit`, or the folder of a run."),
 )

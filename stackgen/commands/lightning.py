@@ -31,11 +31,11 @@ from stackgen.stack import StackgenError
 
 EXAMPLES = {
     "fit": """
-stackgen fit --config configs/model/ddpm.yaml --data.path data/paper
-stackgen fit --config configs/model/ddpm.yaml --data.path data/paper --ckpt_path last""",
-    "validate": "stackgen validate --ckpt_path runs/ddpm/version_0/checkpoints/last.ckpt",
-    "test": "stackgen test\nstackgen test --model.weights runs/ddpm/version_0/checkpoints/last.ckpt",
-    "predict": "stackgen predict --model.weights runs/ddpm/version_0/checkpoints/last.ckpt",
+stackgen fit --config configs/model/ddpm-small.yaml --data.path data/paper
+stackgen fit --config configs/model/ddpm-small.yaml --data.path data/paper --ckpt_path last""",
+    "validate": "stackgen validate --ckpt_path runs/ddpm-small/version_0/checkpoints/last.ckpt",
+    "test": "stackgen test\nstackgen test --model.weights runs/ddpm-small/version_0/checkpoints/last.ckpt",
+    "predict": "stackgen predict --model.weights runs/ddpm-small/version_0/checkpoints/last.ckpt",
 }
 
 _FOLDER = "STACKGEN_RUN_FOLDER"  # tells the other processes of a distributed run where the first one writes
@@ -98,7 +98,7 @@ class StackgenCLI(LightningCLI):
         self.config = parse(parser, verb, [verb, *rest])
         config = self.config[verb]
         if config.get("model") is None:
-            raise StackgenError(f"no model: give one, e.g. stackgen {verb} --config configs/model/ddpm.yaml")
+            raise StackgenError(f"no model: give one, e.g. stackgen {verb} --config configs/model/ddpm-small.yaml")
         root = Path(config.trainer.default_root_dir)
         if config.ckpt_path == "last":
             config.ckpt_path = str(last_checkpoint(root / config.name))

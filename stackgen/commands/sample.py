@@ -61,7 +61,7 @@ def main(
                 write_result(result, folder)
                 progress.advance(task)
                 finished += 1
-                add_entries(table, image.name, result.entries)
+                add_entries(table, image.name, result.entries, most=1)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"{finished} of {len(images)} images are finished in {out}") from None
     console = Console()
@@ -141,4 +141,6 @@ COMMAND = Command(
 
 def run(verb: str, argv: Sequence[str]) -> int | None:
     """Run the verb."""
+    # A few stacks keep one thread busy; more only wait for each other, and for whoever else uses the machine.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     return COMMAND.run(argv)

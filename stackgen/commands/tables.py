@@ -20,8 +20,15 @@ def verdict_table(source: str) -> Table:
     return table
 
 
-def add_entries(table: Table, source: str, entries: Iterable[Entry]) -> None:
-    """One row for each stack, numbered from 1; blocks are numbered from 0, as in the file and the picture."""
+def add_entries(table: Table, source: str, entries: Iterable[Entry], most: int | None = None) -> None:
+    """One row for each stack, numbered from 1; blocks are numbered from 0, as in the file and the picture.
+
+    Args:
+        table: To add to.
+        source: Where the stacks came from.
+        entries: The stacks, judged.
+        most: Blocks that fell to name for each stack, at most; all by default.
+    """
     for number, entry in enumerate(entries, 1):
         stands = entry.verdict is not None and entry.verdict.stable
         table.add_row(
@@ -29,17 +36,22 @@ def add_entries(table: Table, source: str, entries: Iterable[Entry]) -> None:
             str(number),
             "[green]stands[/]" if stands else "[red]falls[/]",
             "" if entry.front_iou is None else f"{entry.front_iou:.2f}",
-            describe_fall(entry.stack, entry.verdict) if entry.verdict else "",
+            describe_fall(entry.stack, entry.verdict, most) if entry.verdict else "",
         )
 
 
-def describe_fall(stack: Stack, verdict: Verdict) -> str:
+def describe_fall(stack: Stack, verdict: Verdict, most: int | None = None) -> str:
     """Which blocks fell and how far, the furthest first; empty where none did.
 
-    >>> stack = Stack([0, 3], [[0, 0, 0.5, 0, 0, 0], [2, 0, 3.5, 0, 0, 0]])
-    >>> describe_fall(stack, Verdict(False, np.array([False, True]), np.array([0.0, 3.0]), stack))
-    'block 1 (triangle) 3.0 cells'
+    >>> stack = Stack(np.array([0, 3]), np.array([[0, 0, 2.5, 0, 0, 0], [2, 0, 3.5, 0, 0, 0]]))
+    >>> verdict = Verdict(False, np.array([True, True]), np.array([2.0, 3.0]), stack)
+    >>> describe_fall(stack, verdict)
+    'block 1 (triangle) 3.0 cells, block 0 (cube) 2.0 cells'
+    >>> describe_fall(stack, verdict, most=1)
+    'block 1 (triangle) 3.0 cells, 1 more'
     """
     fallen = np.flatnonzero(verdict.fell)
     order = fallen[np.argsort(-verdict.drop[fallen], kind="stable")]
-    return ", ".join(f"block {i} ({stack.names[i]}) {verdict.drop[i]:.1f} cells" for i in order)
+    parts = [f"block {i} ({stack.names[i]}) {verdict.drop[i]:.1f} cells" for i in order]
+    rest = parts[most:] if most is not None else []
+    return ", ".join([*parts[:most], *([f"{len(rest)} more"] if rest else [])])

@@ -12,6 +12,7 @@ import hashlib
 import io
 import json
 import tarfile
+import tokenize
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -83,6 +84,16 @@ class Manifest:
         """The shards of a split, in order."""
         return [folder / shard["file"] for shard in self.shards if shard["split"] == split]
 
+    def samples(self, folder: Path, split: Split) -> Iterator[Sample]:
+        """The samples of a split, in order, from shards whose checksums are right.
+
+        Raises:
+            StackgenError: If a shard is missing or is not the one that was written.
+        """
+        for shard in self.shards:
+            if shard["split"] == split:
+                yield from read_shard(folder / shard["file"], shard["sha256"])
+
     def to_json(self) -> dict[str, Any]:
         """Plain form, as stored."""
         return {
@@ -118,7 +129,9 @@ class Manifest:
         try:
             data = json.loads(path.read_text())
         except FileNotFoundError as error:
-            raise StackgenError(f"no dataset at {folder}: there is no dataset.json in it; make one with `stackgen generate`") from error
+            raise StackgenError(
+                f"no dataset at {folder}: there is no dataset.json in it; make one with `stackgen generate`"
+            ) from error
         except (OSError, ValueError) as error:
             raise StackgenError(f"{path} is not readable as JSON: {error}") from error
         if not isinstance(data, dict) or data.get("format") != FORMAT:
@@ -159,38 +172,60 @@ def write_shard(path: Path, samples: Iterable[Sample]) -> dict[str, Any]:
     return {"file": path.name, "split": split, "samples": count, "sha256": hashlib.sha256(content).hexdigest()}
 
 
-def read_shard(path: str | Path) -> Iterator[Sample]:
+def read_shard(path: str | Path, sha256: str | None = None) -> Iterator[Sample]:
     """The samples of one tar, in order.
 
+    Args:
+        path: Of the tar.
+        sha256: What its checksum must be, as the manifest has it; None trusts the file.
+
     Raises:
-        StackgenError: If the file is missing, truncated or not a shard.
+        StackgenError: If the file is missing, truncated or not a shard, or has another checksum.
     """
-    members: dict[str, bytes] = {}
     try:
-        with tarfile.open(path, mode="r:") as tar:
-            for member in tar:
-                key, _, suffix = member.name.partition(".")
-                file = tar.extractfile(member)
-                if file is None:
-                    continue
-                members[suffix] = file.read()
-                if len(members) == 4:
-                    yield decode_sample(key, members)
-                    members = {}
-    except (OSError, tarfile.TarError, KeyError, ValueError, EOFError) as error:
-        raise StackgenError(f"shard {path} is missing or damaged: {error}") from error
-    if members:
-        raise StackgenError(f"shard {path} ends in the middle of a sample")
+        content = Path(path).read_bytes()
+        if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
+            raise ValueError("its checksum is not the one in dataset.json")
+        yield from _decode_tar(content)
+    except (OSError, tarfile.TarError, KeyError, ValueError, EOFError, tokenize.TokenError) as error:
+        raise StackgenError(f"shard {path} is missing or damaged: {' '.join(str(error).split())}") from error
+
+
+def _decode_tar(content: bytes) -> Iterator[Sample]:
+    members: dict[str, bytes] = {}
+    with tarfile.open(fileobj=io.BytesIO(content), mode="r:") as tar:
+        for member in tar:
+            key, _, suffix = member.name.partition(".")
+            file = tar.extractfile(member)
+            if file is None:
+                continue
+            members[suffix] = file.read()
+            if len(members) == 4:
+                yield decode_sample(key, members)
+                members = {}
+        # Python's reader takes a damaged header, or no end at all, for the end of the archive.
+        if members or len(content) < tar.offset + 2 * tarfile.BLOCKSIZE or any(content[tar.offset :]):
+            raise ValueError("it ends too early")
 
 
 def decode_sample(key: str, members: dict[str, bytes]) -> Sample:
-    """A sample from the contents of its members, by suffix."""
+    """A sample from the contents of its members, by suffix.
+
+    Raises:
+        KeyError: If a member is missing.
+        ValueError: If one is not what the format says.
+    """
     arrays = {
         name: np.load(io.BytesIO(members[f"{name}.npy"]), allow_pickle=False)
         for name in ("shapes", "poses", "silhouette")
     }
+    shapes, poses, meta = arrays["shapes"], arrays["poses"], json.loads(members["meta.json"])
     picture = np.unpackbits(arrays["silhouette"], axis=1).astype(bool)
-    return Sample(key, arrays["shapes"], arrays["poses"], picture, json.loads(members["meta.json"]))
+    if shapes.dtype != np.uint8 or shapes.ndim != 1 or poses.dtype != np.float32 or poses.shape != (len(shapes), 6):
+        raise ValueError(f"sample {key}: shapes {shapes.shape} do not fit poses {poses.shape}")
+    if not isinstance(meta, dict):
+        raise ValueError(f"sample {key}: meta.json is not an object")
+    return Sample(key, shapes, poses, picture, meta)
 
 
 def _members(sample: Sample) -> Iterator[tuple[str, bytes]]:

@@ -121,10 +121,10 @@ class CNNPredictor:
     @torch.inference_mode()
     def predict(self, silhouettes: Mask, top: int = 1) -> NDArray[np.int64]:
         """(B, H, W) silhouettes to the `top` most likely block lists of each, (B, top, S)."""
-        best = []
+        best, device = [], self.network.lists.device
         for part in np.array_split(silhouettes, max(1, math.ceil(len(silhouettes) / 256))):
-            logits = self.network(torch.from_numpy(np.ascontiguousarray(part, dtype=np.float32)))
-            best.append(self.network.lists[logits.topk(top).indices].numpy())
+            logits = self.network(torch.from_numpy(np.ascontiguousarray(part, dtype=np.float32)).to(device))
+            best.append(self.network.lists[logits.topk(top).indices].cpu().numpy())
         return np.concatenate(best)
 
 

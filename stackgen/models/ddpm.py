@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -62,12 +63,19 @@ class DDPM(WorldMixin, pl.LightningModule):
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """One step of Eq. 3's loss, logged by quarter of the steps too."""
-        losses, t = self.model.loss(batch, self.draws)
+        losses, t = self.model.loss(batch, self.draws, self._noise_of_step(index, batch["poses"].device))
         loss = losses.mean()
         self.log("train/loss", loss, prog_bar=True)
-        if self.trainer.global_step % self.trainer.log_every_n_steps == 0:
+        if self.trainer.global_step % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
             self._log_quarters("train", losses.detach(), t)
         return loss
+
+    def _noise_of_step(self, index: int, device: torch.device) -> torch.Generator:
+        """A generator that depends on seed, process, epoch and step alone: a resumed fit draws what the
+        uninterrupted one would have, and no two processes draw the same."""
+        place = (torch.initial_seed() % 2**63, self.global_rank, self.current_epoch, index)
+        seed = int(np.random.SeedSequence(place).generate_state(1, np.uint64)[0] >> 1)
+        return torch.Generator(device=device).manual_seed(seed)
 
     def validation_step(self, batch: dict[str, Tensor], index: int) -> None:
         """The same loss on held-out stacks, with the same noise every time."""

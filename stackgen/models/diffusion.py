@@ -70,7 +70,9 @@ class PoseDiffusion(nn.Module):
         self.mean.copy_(torch.as_tensor(np.asarray(mean)))
         self.std.copy_(torch.as_tensor(np.asarray(std)).clamp(min=max(self.config.least_std, 1e-6)))
 
-    def loss(self, batch: dict[str, Tensor], draws: int = 1, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+    def loss(
+        self, batch: dict[str, Tensor], draws: int = 1, generator: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Mean squared error per sample and draw, averaged over its real blocks (paper, Eq. 3).
 
         Args:

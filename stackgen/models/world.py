@@ -1,4 +1,4 @@
-"""What every training module shares: it learns which world it lives in from its data, and says so in its checkpoints."""
+"""What every training module shares: it learns its world from its data, and names it in its checkpoints."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 from stackgen.data.shards import manifest_sha256
 from stackgen.geometry import PAPER_GRID, Grid
-from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue
+from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, StackgenError
 
 CHECKPOINT_KEY = "stackgen"
 """Where a Lightning checkpoint holds the card of its model."""
@@ -60,8 +60,14 @@ class WorldMixin:
         checkpoint[CHECKPOINT_KEY] = self.card()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take the world from the checkpoint and build the network for its weights."""
-        card = checkpoint[CHECKPOINT_KEY]
+        """Take the world from the checkpoint and build the network for its weights.
+
+        Raises:
+            StackgenError: If it is not a checkpoint of this kind of model.
+        """
+        card = checkpoint.get(CHECKPOINT_KEY)
+        if not isinstance(card, dict) or card.get("kind") != self.kind:
+            raise StackgenError(f"the checkpoint is not one of a {type(self).__name__} of stackgen")
         self.catalogue, self.grid = Catalogue.from_json(card["catalogue"]), Grid(**card["grid"])
         self.max_blocks, self.dataset = card["max_blocks"], card["dataset"]
         self.build()

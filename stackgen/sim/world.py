@@ -9,7 +9,6 @@ before, nor on the order of its blocks (tests/sim).
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import sys
 from collections.abc import Iterator
@@ -26,22 +25,23 @@ from stackgen.stack import PAPER_CATALOGUE, Catalogue, Shape, Stack
 
 
 @contextlib.contextmanager
-def _quiet_stdout() -> Iterator[None]:
-    """Silence what native code prints: PyBullet greets at import."""
-    sys.stdout.flush()
-    saved, null = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, 1)
+def _quiet() -> Iterator[None]:
+    """Silence what native code prints: PyBullet greets at import, on the error stream."""
+    sys.stderr.flush()
+    saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, 2)
     try:
         yield
     finally:
-        ctypes.CDLL(None).fflush(None)
-        os.dup2(saved, 1)
+        sys.stderr.flush()
+        os.dup2(saved, 2)
         os.close(saved)
         os.close(null)
 
 
-with _quiet_stdout():
+with _quiet():
     import pybullet as bullet
+
 
 @dataclass(frozen=True)
 class Rollout:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stackgen.sim.verdict import AcceptLimits, accept
 from stackgen.sim.world import Simulator
@@ -86,7 +87,7 @@ def surely_falls(stack: Stack, reach: float = 0.1, slack: float = 0.05) -> bool:
     bottom, top = z - sizes[:, 2] / 2, z + sizes[:, 2] / 2
     overlap = (left[:, None] < right) & (left < right[:, None])
     rests = (np.abs(bottom[:, None] - top) < reach) & overlap  # [upper, lower]
-    bears = rests.any(axis=0)
+    bears: NDArray[np.bool_] = np.any(rests, axis=0)
     for block in np.flatnonzero(bottom > reach):
         supports = rests[block]
         if not supports.any():

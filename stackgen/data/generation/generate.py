@@ -8,10 +8,15 @@ is started again goes on with those that are missing.
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import hashlib
 import json
 import multiprocessing
 import os
+import shutil
+import signal
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass, field, replace
@@ -32,6 +37,7 @@ from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, StackgenError
 
 TESTSET = Path(__file__).resolve().parents[2] / "assets" / "testset-v1"
 _GOLDEN = 0.6180339887498949
+_HOPELESS = 2000  # templates without a stack, after which none is expected
 
 
 @dataclass(frozen=True)
@@ -75,7 +81,9 @@ class GenerateSettings:
 
     def __post_init__(self) -> None:
         if self.stacks < 1 or self.templates_per_shard < 1 or self.max_blocks < 1 or self.max_removals < 0:
-            raise StackgenError("generate: stacks, templates_per_shard and max_blocks must be at least 1, max_removals 0")
+            raise StackgenError(
+                "generate: stacks, templates_per_shard and max_blocks must be at least 1, max_removals 0"
+            )
         if self.validation < 0 or self.test < 0 or self.validation + self.test > 1:
             raise StackgenError("generate: validation and test are shares of the templates; their sum is at most 1")
         if not 0 <= self.draw <= self.stacks:
@@ -113,43 +121,48 @@ def generate(
     Raises:
         StackgenError: If the folder holds something else.
     """
-    excluded = frozenset(testset_layouts(settings.catalogue, settings.grid)) if settings.exclude_testset else frozenset()
     _claim(out, settings)
-    entries: list[dict[str, Any]] = []
-    stored = 0
-    for entry in _shards_in_order(settings, out, excluded, workers or os.cpu_count() or 1):
-        entries.append(entry)
-        stored += entry["samples"]
-        if progress:
-            progress(min(stored, settings.stacks))
-        if stored >= settings.stacks:
-            break
-    entries[-1] = _trim(out, entries[-1], entries[-1]["samples"] - (stored - settings.stacks))
+    parts = out / "parts" if settings.draw else out  # what is drawn must not overwrite what it is drawn from
+    manifest = _finished(out)
+    if manifest is None:
+        parts.mkdir(exist_ok=True)
+        entries = _make_shards(settings, parts, workers or os.cpu_count() or 1, progress or (lambda stored: None))
+        if settings.draw:
+            entries = [_draw(out, parts, entries, settings)]
+        manifest = _manifest(settings, tuple(entries))
+        manifest.save(out)
     if settings.draw:
-        entries = _draw(out, entries, settings)
-    manifest = _manifest(settings, tuple(entry for entry in entries if entry["samples"]))
-    manifest.save(out)
+        shutil.rmtree(parts, ignore_errors=True)
     known = {entry["file"] for entry in manifest.shards}
-    for path in out.glob("*.tar"):
+    for path in [*out.glob("*.tar"), *out.glob(".*.tmp")]:  # of shards made ahead, and of killed writers
         if path.name not in known:
             path.unlink()
     return manifest
 
 
 def testset_layouts(catalogue: Catalogue, grid: Grid) -> set[str]:
-    """Layouts of the templates that `testset-v1` was made from, and their mirror images."""
+    """Layouts of the templates that `testset-v1` was made from, and their mirror images, in the numbers of
+    another catalogue: shapes are the same if name and outline are."""
     if not (TESTSET / "dataset.json").exists():
         return set()
     manifest = Manifest.load(TESTSET)
+    if (grid.width, grid.height) != (manifest.grid.width, manifest.grid.height):
+        return set()
+    numbers = {
+        i: catalogue.shapes.index(shape) for i, shape in enumerate(manifest.catalogue) if shape in catalogue.shapes
+    }
     layouts: set[str] = set()
-    for path in manifest.paths(TESTSET, "test"):
-        for sample in read_shard(path):
-            template = Template.from_key(sample.meta["layout"])
-            layouts |= {template.key, template.mirrored(manifest.catalogue, manifest.grid).key}
+    for key in {sample.meta["layout"] for sample in manifest.samples(TESTSET, "test")}:
+        rows = Template.from_key(key).rows
+        if all(shape in numbers for row in rows for shape, _ in row):
+            template = Template(tuple(tuple((numbers[shape], left) for shape, left in row) for row in rows))
+            layouts |= {template.key, template.mirrored(catalogue, grid).key}
     return layouts
 
 
-def template_samples(settings: GenerateSettings, number: int, excluded: frozenset[str], simulator: Simulator) -> list[Sample]:
+def template_samples(
+    settings: GenerateSettings, number: int, excluded: frozenset[str], simulator: Simulator
+) -> list[Sample]:
     """All stacks that one template gives, or none."""
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
     template = draw_template(rng, settings.template, settings.catalogue, settings.grid)
@@ -167,6 +180,28 @@ def template_samples(settings: GenerateSettings, number: int, excluded: frozense
         meta = {"template": number, "layout": template.key, "removed": list(removed)}
         samples.append(Sample(key, stack.shapes.astype(np.uint8), poses, picture, meta))
     return samples
+
+
+def _make_shards(
+    settings: GenerateSettings, out: Path, workers: int, progress: Callable[[int], None]
+) -> list[dict[str, Any]]:
+    """Write as many shards as it takes, the last one cut to size; returns the entries of those not empty."""
+    excluded = (
+        frozenset(testset_layouts(settings.catalogue, settings.grid)) if settings.exclude_testset else frozenset()
+    )
+    entries: list[dict[str, Any]] = []
+    stored = 0
+    for shard, entry in enumerate(_shards_in_order(settings, out, excluded, workers)):
+        stored += entry["samples"]
+        progress(min(stored, settings.stacks))
+        if entry["samples"]:
+            entries.append(entry)
+        if stored >= settings.stacks:
+            break
+        if not stored and shard * settings.templates_per_shard > _HOPELESS:
+            raise StackgenError(f"generate: {_HOPELESS} templates gave no stack; relax max_blocks, accept or template")
+    entries[-1] = _trim(out, entries[-1], entries[-1]["samples"] - (stored - settings.stacks))
+    return entries
 
 
 def _make_shard(settings: GenerateSettings, out: Path, shard: int, excluded: frozenset[str]) -> dict[str, Any]:
@@ -199,14 +234,15 @@ def _shards_in_order(
 ) -> Iterator[dict[str, Any]]:
     """Manifest entries of shard 0, 1, 2, ..., made ahead by a pool of processes."""
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=context)
+    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent)
     waiting: dict[int, Future[dict[str, Any]]] = {}
     ahead = 0
     shard = 0
     try:
         while True:
             while len(waiting) < 2 * workers:
-                waiting[ahead] = pool.submit(_make_shard, settings, out, ahead, excluded)
+                with _without_interrupts():
+                    waiting[ahead] = pool.submit(_make_shard, settings, out, ahead, excluded)
                 ahead += 1
             while not waiting[shard].done():
                 wait([waiting[shard]], timeout=1, return_when=FIRST_COMPLETED)
@@ -216,6 +252,41 @@ def _shards_in_order(
         for process in list(getattr(pool, "_processes", {}).values()):
             process.terminate()
         pool.shutdown(wait=False, cancel_futures=True)
+
+
+@contextlib.contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Processes that start here never see Ctrl-C: the parent alone answers it."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end_with_parent() -> None:
+    """In a worker: end when the parent is gone, even if it was killed; a pool's workers would wait forever."""
+
+    def follow() -> None:
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+def _finished(out: Path) -> Manifest | None:
+    """The manifest, if all is there that it names."""
+    if not (out / "dataset.json").exists():
+        return None
+    manifest = Manifest.load(out)
+    files = {path.name: path for path in out.glob("*.tar")}
+    for entry in manifest.shards:
+        path = files.get(entry["file"])
+        if path is None or hashlib.sha256(path.read_bytes()).hexdigest() != entry["sha256"]:
+            return None
+    return manifest
 
 
 def _manifest(settings: GenerateSettings, entries: tuple[dict[str, Any], ...]) -> Manifest:
@@ -253,10 +324,9 @@ def _trim(out: Path, entry: dict[str, Any], keep: int) -> dict[str, Any]:
     return write_shard(path, list(read_shard(path))[:keep])
 
 
-def _draw(out: Path, entries: list[dict[str, Any]], settings: GenerateSettings) -> list[dict[str, Any]]:
+def _draw(out: Path, parts: Path, entries: list[dict[str, Any]], settings: GenerateSettings) -> dict[str, Any]:
     """Keep `settings.draw` stacks of all, drawn uniformly, in one shard."""
-    samples = [sample for entry in entries for sample in read_shard(out / entry["file"])]
+    samples = [sample for entry in entries for sample in read_shard(parts / entry["file"])]
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(2**32,)))
     chosen = np.sort(rng.choice(len(samples), settings.draw, replace=False))
-    path = out / entries[0]["file"]
-    return [write_shard(path, [samples[i] for i in chosen])]
+    return write_shard(out / entries[0]["file"], [samples[i] for i in chosen])

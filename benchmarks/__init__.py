@@ -1,0 +1,8 @@
+"""How fast and how large things are. Run from the repository root, on a quiet machine:
+
+    python -m benchmarks.cold_start --out docs/results/cold_start.json
+    python -m benchmarks.training_speed --out docs/results/training_speed.json
+    python -m benchmarks.simulator --out docs/results/simulator.json
+
+Each prints what it found and on which machine. Figures are for reading: nothing here passes or fails.
+"""

@@ -1,0 +1,165 @@
+"""Shards are read back as written, say the same bytes for the same stacks, and never lie about damage."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import webdataset
+
+from stackgen.data.shards import FORMAT, SPLITS, Manifest, Sample, decode_sample, read_shard, write_shard
+from stackgen.stack import PAPER_CATALOGUE, StackgenError
+
+
+def assert_same(a: Sample, b: Sample) -> None:
+    assert a.key == b.key and a.meta == b.meta
+    for name in ("shapes", "poses", "silhouette"):
+        here, there = getattr(a, name), getattr(b, name)
+        assert here.dtype == there.dtype and here.shape == there.shape and (here == there).all()
+
+
+@pytest.fixture
+def three(samples: dict[str, list[Sample]], tmp_path: Path) -> tuple[Path, dict[str, Any]]:
+    """A shard of three samples, and its entry."""
+    path = tmp_path / "train-000007.tar"
+    return path, write_shard(path, samples["train-000000.tar"][:3])
+
+
+def test_a_shard_is_read_back_as_written(dataset: Path, samples: dict[str, list[Sample]]) -> None:
+    for name, those in samples.items():
+        found = list(read_shard(dataset / name))
+        assert len(found) == len(those)
+        for here, there in zip(found, those, strict=True):
+            assert_same(here, there)
+            stack = here.stack(PAPER_CATALOGUE)
+            assert stack.shapes.tolist() == there.shapes.tolist() and (stack.poses == there.poses).all()
+
+
+def test_a_manifest_s_samples_are_those_of_the_split(dataset: Path, samples: dict[str, list[Sample]]) -> None:
+    manifest = Manifest.load(dataset)
+    for split in SPLITS:
+        wanted = [sample for name, those in samples.items() if name.startswith(split) for sample in those]
+        found = list(manifest.samples(dataset, split))
+        assert [sample.key for sample in found] == [sample.key for sample in wanted]
+        assert manifest.count(split) == len(wanted)
+
+
+def test_equal_stacks_make_equal_bytes(three: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
+    path, entry = three
+    again = tmp_path / "elsewhere" / path.name
+    again.parent.mkdir()
+    assert write_shard(again, list(read_shard(path))) == entry
+    assert again.read_bytes() == path.read_bytes()
+    assert entry["file"] == "train-000007.tar" and entry["split"] == "train" and entry["samples"] == 3
+    with tarfile.open(path) as tar:
+        assert {(m.mtime, m.uid, m.gid, m.uname, m.gname) for m in tar} == {(0, 0, 0, "", "")}
+
+
+def test_others_read_it_with_webdataset_and_numpy(dataset: Path, samples: dict[str, list[Sample]]) -> None:
+    rows = list(webdataset.WebDataset(str(dataset / "validation-000002.tar"), shardshuffle=False))
+    for row, sample in zip(rows, samples["validation-000002.tar"], strict=True):
+        assert row["__key__"] == sample.key
+        poses = np.load(io.BytesIO(row["poses.npy"]))
+        assert poses.dtype == np.float32 and (poses == sample.poses).all()
+        assert (np.load(io.BytesIO(row["shapes.npy"])) == sample.shapes).all()
+        assert (np.unpackbits(np.load(io.BytesIO(row["silhouette.npy"])), axis=1) == sample.silhouette).all()
+        assert json.loads(row["meta.json"]) == sample.meta
+
+
+def test_an_empty_shard_has_no_samples(tmp_path: Path) -> None:
+    assert write_shard(tmp_path / "train-000000.tar", [])["samples"] == 0
+    assert list(read_shard(tmp_path / "train-000000.tar")) == []
+
+
+# Damage.
+
+
+def test_a_shard_cut_off_anywhere_is_damaged(three: tuple[Path, dict[str, Any]]) -> None:
+    """Also between two samples, where Python's reader sees nothing wrong."""
+    path, _ = three
+    content = path.read_bytes()
+    used = len(content.rstrip(b"\0"))
+    for length in [0, 1, *range(512, used + 512, 512), used]:
+        path.write_bytes(content[:length])
+        with pytest.raises(StackgenError, match=rf"{path.name} is missing or damaged") as caught:
+            list(read_shard(path))
+        assert "\n" not in str(caught.value)
+
+
+def test_a_changed_byte_is_never_overlooked(three: tuple[Path, dict[str, Any]]) -> None:
+    """With the manifest's checksum; without it, at least nothing but samples or a StackgenError comes out."""
+    path, entry = three
+    content, places = path.read_bytes(), np.random.default_rng(0)
+    assert len(list(read_shard(path, entry["sha256"]))) == 3
+    for place in places.integers(0, len(content.rstrip(b"\0")), 300):
+        broken = bytearray(content)
+        broken[place] ^= 1 << int(places.integers(8))
+        path.write_bytes(broken)
+        with pytest.raises(StackgenError, match="checksum"):
+            next(read_shard(path, entry["sha256"]))
+        try:
+            found = list(read_shard(path))
+        except StackgenError:
+            continue
+        assert len(found) == 3
+        assert all(sample.poses.shape == (len(sample.shapes), 6) for sample in found)
+
+
+def test_a_missing_shard_and_a_file_that_is_none_are_named(tmp_path: Path) -> None:
+    with pytest.raises(StackgenError, match=r"gone\.tar is missing"):
+        list(read_shard(tmp_path / "gone.tar"))
+    (tmp_path / "text.tar").write_text("not a tar" * 1000)
+    with pytest.raises(StackgenError, match=r"text\.tar"):
+        list(read_shard(tmp_path / "text.tar"))
+
+
+def test_pickles_are_not_read(three: tuple[Path, dict[str, Any]]) -> None:
+    sample = next(read_shard(three[0]))
+    buffer = io.BytesIO()
+    np.save(buffer, np.array([print], dtype=object), allow_pickle=True)
+    members = {"shapes.npy": buffer.getvalue(), "poses.npy": b"", "silhouette.npy": b"", "meta.json": b"{}"}
+    with pytest.raises(ValueError, match="allow_pickle"):
+        decode_sample(sample.key, members)
+
+
+# The manifest.
+
+
+def test_a_manifest_survives_its_file(dataset: Path, tmp_path: Path) -> None:
+    manifest = Manifest.load(dataset)
+    manifest.save(tmp_path)
+    assert Manifest.load(tmp_path) == manifest
+    assert (tmp_path / "dataset.json").read_bytes() == (dataset / "dataset.json").read_bytes()
+    assert manifest.to_json()["format"] == FORMAT
+    assert manifest.to_json()["counts"] == {"train": 71, "validation": 23, "test": 7}
+
+
+def test_the_manifest_s_hash_names_every_shard_s(dataset: Path) -> None:
+    manifest = Manifest.load(dataset)
+    changed = json.loads(json.dumps(manifest.to_json()))
+    changed["shards"][1]["sha256"] = "0" * 64
+    other = Manifest(**{**vars(manifest), "shards": tuple(changed["shards"])})
+    assert other.sha256 != manifest.sha256 == Manifest.load(dataset).sha256
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "no dataset at"),
+        ("{", "not readable as JSON"),
+        ("[]", "not a stackgen.dataset/1 manifest"),
+        ('{"format": "other"}', "not a stackgen.dataset/1 manifest"),
+        ('{"format": "stackgen.dataset/1"}', "damaged"),
+    ],
+)
+def test_a_folder_without_a_proper_manifest_is_refused(tmp_path: Path, text: str | None, message: str) -> None:
+    if text is not None:
+        (tmp_path / "dataset.json").write_text(text)
+    with pytest.raises(StackgenError, match=message) as caught:
+        Manifest.load(tmp_path)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,255 @@
+"""Diffusion over poses: losses and samples where a perfect predictor makes them known."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from stackgen.data.arrays import StackArrays
+from stackgen.geometry import Mask
+from stackgen.models.denoiser import DenoiserConfig
+from stackgen.models.diffusion import DiffusionConfig, DiffusionSampler, PoseDiffusion, pad_shapes
+from stackgen.models.schedules import ScheduleConfig
+from stackgen.stack import StackgenError, shapes_of
+from tests.models.conftest import TINY, TINY_CROSS
+
+MEAN, STD = np.array([0.1, 0, 1.9, 0, 0, 0]), np.array([1.1, 0.01, 1.2, 0.02, 0.03, 0.04])
+
+Prediction = Literal["epsilon", "v"]
+
+
+class Oracle(torch.nn.Module):
+    """Knows the clean poses (B, N, 6), but for a constant error, and answers as the diffusion asks."""
+
+    def __init__(self, model: PoseDiffusion, clean: Tensor, error: float = 0.0) -> None:
+        super().__init__()
+        self.config, self.parts = model.denoiser.config, (model.schedule, model.config.prediction)
+        self.clean = clean + error
+
+    def encode(self, silhouette: Tensor) -> Tensor:
+        return torch.zeros(len(silhouette), 1, 1)
+
+    def forward(self, x: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor) -> Tensor:
+        (schedule, prediction), clean = self.parts, self.clean.repeat_interleave(len(x) // len(self.clean), 0)
+        signal, sigma = schedule.signal_and_noise(t)
+        noise = (x - signal * clean) / sigma
+        return noise if prediction == "epsilon" else signal * noise - sigma * clean
+
+
+class Silent(Oracle):
+    """Estimates zero."""
+
+    def forward(self, x: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor) -> Tensor:
+        return torch.zeros_like(x)
+
+
+def model_for(prediction: Prediction = "epsilon", denoiser: DenoiserConfig = TINY, clip: float | None = None) -> PoseDiffusion:
+    torch.manual_seed(0)
+    model = PoseDiffusion(denoiser, ScheduleConfig(), DiffusionConfig(prediction, clip))
+    with torch.no_grad():
+        for weight in model.parameters():
+            weight.normal_(0, 0.1)
+    model.fit_normalization(MEAN, STD)
+    return model.eval()
+
+
+@pytest.fixture
+def batch(arrays: StackArrays) -> dict[str, Tensor]:
+    return arrays.batch(range(12))
+
+
+def normalised(model: PoseDiffusion, batch: dict[str, Tensor]) -> Tensor:
+    return (batch["poses"] - model.mean) / model.std
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+# Losses.
+
+
+@pytest.mark.parametrize("prediction", ["epsilon", "v"])
+def test_a_perfect_predictor_has_no_loss(prediction: Prediction, batch: dict[str, Tensor]) -> None:
+    model = model_for(prediction)
+    model.denoiser = Oracle(model, normalised(model, batch))  # type: ignore[assignment]
+    losses, t = model.loss(batch, 4, generator())
+    assert losses.shape == t.shape == (48,)
+    late = t > 3  # before, a float's rounding is divided by a tiny sigma
+    assert losses[late].max() < 1e-6 and losses.max() < 1e-3
+
+
+def test_an_error_of_the_clean_estimate_costs_what_the_algebra_says(batch: dict[str, Tensor]) -> None:
+    """delta off: epsilon is off by delta sqrt(abar) / sqrt(1 - abar), v by delta / sqrt(1 - abar)."""
+    delta = 0.3
+    for prediction in ("epsilon", "v"):
+        model = model_for(prediction)  # type: ignore[arg-type]
+        model.denoiser = Oracle(model, normalised(model, batch), delta)  # type: ignore[assignment]
+        losses, t = model.loss(batch, 8, generator())
+        bar = model.schedule.alpha_bar[t].float()
+        expected = delta**2 / (1 - bar) * (bar if prediction == "epsilon" else 1)
+        assert losses == pytest.approx(expected, rel=1e-2)
+
+
+def test_saying_nothing_costs_the_target(batch: dict[str, Tensor]) -> None:
+    """A zero estimate: E |epsilon|^2 = 1, and E |v|^2 = abar + (1 - abar) x_0^2, averaged over the real blocks."""
+    for prediction in ("epsilon", "v"):
+        model = model_for(prediction)  # type: ignore[arg-type]
+        clean = normalised(model, batch)
+        model.denoiser = Silent(model, clean)  # type: ignore[assignment]
+        losses, t = model.loss(batch, 400, generator())
+        bar = model.schedule.alpha_bar[t].float()
+        mask = batch["mask"].float()
+        square = ((clean.square().mean(-1) * mask).sum(-1) / mask.sum(-1)).repeat_interleave(400)
+        expected = torch.ones_like(bar) if prediction == "epsilon" else bar + (1 - bar) * square
+        assert losses.mean().item() == pytest.approx(expected.mean().item(), rel=0.02)
+
+
+def test_every_step_is_drawn_alike(batch: dict[str, Tensor]) -> None:
+    model = model_for()
+    model.denoiser = Silent(model, normalised(model, batch))  # type: ignore[assignment]
+    _, t = model.loss(batch, 1000, generator())
+    shares = torch.bincount(t, minlength=51)
+    assert shares[0] == 0 and len(shares) == 51
+    assert shares[1:].float() == pytest.approx(torch.full((50,), 240.0), abs=5 * 240**0.5)
+
+
+@pytest.mark.parametrize("denoiser", [TINY, TINY_CROSS], ids=["paper", "cross"])
+def test_what_stands_at_padding_costs_nothing(denoiser: DenoiserConfig, batch: dict[str, Tensor]) -> None:
+    model = model_for(denoiser=denoiser)
+    other = {**batch, "poses": torch.where(batch["mask"][..., None], batch["poses"], torch.tensor(9.0))}
+    assert not batch["mask"].all()
+    a, b = (model.loss(those, 2, generator())[0] for those in (batch, other))
+    assert a == pytest.approx(b, rel=1e-4)
+
+
+def test_the_order_of_the_blocks_costs_nothing_where_the_model_orders_them(batch: dict[str, Tensor]) -> None:
+    model = model_for(denoiser=TINY_CROSS)
+    order = torch.stack([torch.randperm(10) for _ in range(12)])
+    shuffled = {
+        **batch,
+        "poses": batch["poses"].gather(1, order[..., None].expand(-1, -1, 6)),
+        "shapes": batch["shapes"].gather(1, order),
+        "mask": batch["mask"].gather(1, order),
+    }
+    a, b = (model.loss(those, 2, generator())[0] for those in (batch, shuffled))
+    assert a == pytest.approx(b, rel=1e-4)
+
+
+def test_draws_of_one_sample_share_its_picture_and_nothing_else(batch: dict[str, Tensor]) -> None:
+    model = model_for()
+    losses, t = model.loss(batch, 3, generator())
+    repeated = {name: part.repeat_interleave(3, 0) for name, part in batch.items()}
+    again, steps = model.loss(repeated, 1, generator())
+    assert (t == steps).all() and losses == pytest.approx(again, rel=1e-4)
+
+
+# Normalisation.
+
+
+def test_constant_dimensions_are_not_divided_by_nothing() -> None:
+    model = PoseDiffusion(TINY, ScheduleConfig(), DiffusionConfig())
+    model.fit_normalization(np.zeros(6), np.zeros(6))
+    assert (model.std > 0).all()
+    bounded = PoseDiffusion(TINY, ScheduleConfig(), DiffusionConfig(least_std=0.05))
+    bounded.fit_normalization(MEAN, STD)
+    assert bounded.std == pytest.approx(torch.tensor([1.1, 0.05, 1.2, 0.05, 0.05, 0.05]))
+    assert bounded.mean == pytest.approx(torch.as_tensor(MEAN, dtype=torch.float32))
+
+
+# Samples.
+
+
+@pytest.mark.parametrize("prediction", ["epsilon", "v"])
+@pytest.mark.parametrize("clip", [None, 6.0])
+def test_a_perfect_predictor_samples_the_truth(
+    prediction: Prediction, clip: float | None, batch: dict[str, Tensor]
+) -> None:
+    """Un-normalised again, in cells and radians."""
+    model = model_for(prediction, clip=clip)
+    batch = {**batch, "poses": torch.where(batch["mask"][..., None], batch["poses"], model.mean)}
+    model.denoiser = Oracle(model, normalised(model, batch))  # type: ignore[assignment]
+    found = model.sample(batch["silhouette"], batch["shapes"], batch["mask"], generator())
+    assert found == pytest.approx(batch["poses"], abs=2e-3)
+
+
+@pytest.mark.parametrize("denoiser", [TINY, TINY_CROSS], ids=["paper", "cross"])
+def test_samples_depend_on_the_seed_and_on_nothing_else(denoiser: DenoiserConfig, arrays: StackArrays) -> None:
+    sampler = DiffusionSampler(model_for(denoiser=denoiser))
+    pictures, counts = arrays.images(range(5)), arrays.counts[:5]
+
+    def poses(seed: int) -> np.ndarray:
+        torch.rand(3)  # the global stream does not matter
+        scenes = sampler.sample_batch(pictures, counts, 3, seed)
+        assert [len(scene) for scene in scenes] == [3] * 5
+        for scene, wanted in zip(scenes, counts, strict=True):
+            for stack in scene:
+                assert stack.shapes.tolist() == shapes_of(wanted).tolist()
+        return np.concatenate([stack.poses for scene in scenes for stack in scene])
+
+    assert (poses(1) == poses(1)).all()
+    assert (poses(1) != poses(2)).any(axis=1).all()
+    assert len({row.tobytes() for row in poses(1)}) == len(poses(1))  # no two blocks alike
+
+
+def test_scenes_do_not_mix(arrays: StackArrays) -> None:
+    """Each scene's blocks go to its own oracle's places, also in several batches."""
+    model = model_for()
+    for batch_size in (512, 6):
+        sampler = DiffusionSampler(model, batch=batch_size)
+        chunk = min(4, batch_size // 3)
+        order = [np.argsort(arrays.shapes[i, : arrays.lengths[i]], kind="stable") for i in range(4)]
+        truth = [arrays.poses[i][o].astype(np.float64) for i, o in enumerate(order)]
+        padded = torch.stack([torch.nn.functional.pad(torch.from_numpy(t), (0, 0, 0, 10 - len(t))) for t in truth])
+        clean = (padded.float() - model.mean) / model.std
+        oracles = iter([Oracle(model, clean[i : i + chunk]) for i in range(0, 4, chunk)])
+        current: list[Oracle] = []
+        model.denoiser = Oracle(model, clean)  # type: ignore[assignment]
+        model.denoiser.encode = lambda s: (current.append(next(oracles)), torch.zeros(len(s), 1, 1))[1]  # type: ignore
+        model.denoiser.forward = lambda *args: current[-1](*args)  # type: ignore[method-assign]
+        scenes = sampler.sample_batch(arrays.images(range(4)), arrays.counts[:4], 3, 0)
+        for scene, expected in zip(scenes, truth, strict=True):
+            for stack in scene:
+                assert stack.poses == pytest.approx(expected, abs=2e-3)
+
+
+def test_the_way_from_noise_is_shown_in_cells(arrays: StackArrays) -> None:
+    sampler, seen = DiffusionSampler(model_for()), {}
+    scenes = sampler.sample_batch(
+        arrays.images([0]), arrays.counts[:1], 2, 0, callback=lambda t, poses: seen.update({t: poses})
+    )
+    assert list(seen) == list(range(50, -1, -1))
+    k = int(arrays.lengths[0])
+    for i, stack in enumerate(scenes[0]):
+        assert seen[0][i, :k] == pytest.approx(stack.poses, abs=1e-6)
+    assert np.abs((seen[50] - MEAN) / STD).mean() == pytest.approx((2 / np.pi) ** 0.5, rel=0.2)  # normal noise
+
+
+def pictures(count: int, size: int = 64) -> Mask:
+    return np.zeros((count, size, size), dtype=bool)
+
+
+@pytest.mark.parametrize(
+    ("silhouettes", "counts", "message"),
+    [
+        (pictures(1, 32), [[1, 0, 0, 0]], r"\(B, 64, 64\)"),
+        (pictures(2), [[1, 0, 0, 0]], "as many"),
+        (pictures(1)[0], [[1, 0, 0, 0]], r"\(B, 64, 64\)"),
+        (pictures(1), [[0, 0, 0, 0]], "1 to 10 blocks"),
+        (pictures(1), [[11, 0, 0, 0]], "1 to 10 blocks"),
+    ],
+)
+def test_what_cannot_be_sampled_is_refused(silhouettes: Mask, counts: list[list[int]], message: str) -> None:
+    with pytest.raises(StackgenError, match=message):
+        DiffusionSampler(model_for()).sample_batch(silhouettes, np.array(counts), 1, 0)
+
+
+def test_padded_shapes_are_the_block_lists() -> None:
+    counts = np.array([[2, 0, 1, 0], [0, 1, 0, 0]])
+    shapes, mask = pad_shapes(counts, 4)
+    assert shapes.tolist() == [[0, 0, 2, -1], [1, -1, -1, -1]]
+    assert (mask == (shapes >= 0)).all()

@@ -1,0 +1,160 @@
+"""Every file in configs/ means something: its verb understands it, and what it describes can be built."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from jsonargparse import ArgumentParser
+from lightning.pytorch import Callback, LightningModule
+from torch import nn
+
+from stackgen.cli import VERBS
+from stackgen.commands import own_sections, parse
+from stackgen.commands.generate import COMMAND as GENERATE
+from stackgen.data.datamodule import StackDataModule
+from stackgen.data.generation.generate import GenerateSettings
+from stackgen.models.cnn import BlockListCNN
+from stackgen.models.ddpm import DDPM
+from stackgen.runs import last_checkpoint
+from stackgen.weights import load_sampler
+from tests.conftest import Cli
+
+CONFIGS = Path(__file__).parents[1] / "configs"
+QUICK = CONFIGS / "quick.yaml"
+ALL = sorted(CONFIGS.rglob("*.yaml"))
+VERB_OF_FOLDER = {"generate": "generate", "model": "fit"}
+
+Load = Callable[[Path], dict[str, Any]]
+
+
+def verbs(path: Path) -> list[str]:
+    """Whose options a file holds: those of its folder's verb, or of each verb that has a section in it."""
+    folder = VERB_OF_FOLDER.get(path.parent.name)
+    return [folder] if folder else [verb for verb in VERBS if verb in yaml.safe_load(path.read_text())]
+
+
+def of(verb: str) -> list[Any]:
+    return [pytest.param(path, id=path.stem) for path in ALL if verb in verbs(path)]
+
+
+@pytest.fixture
+def fit_options(cli: Cli) -> Load:
+    """All options of `fit` as a configuration sets them, defaults filled in."""
+
+    def load(path: Path) -> dict[str, Any]:
+        answer = cli("fit", "--config", path, "--data.path", "x", "--print_config")
+        assert answer.code == 0, answer.err
+        return yaml.safe_load(io.StringIO(answer.out))
+
+    return load
+
+
+def build(options: dict[str, Any]) -> tuple[Any, StackDataModule, list[Callback]]:
+    """Training module with its network, data module and callbacks."""
+    parser = ArgumentParser(exit_on_error=False)
+    parser.add_subclass_arguments(LightningModule, "model")
+    parser.add_class_arguments(StackDataModule, "data")
+    parser.add_argument("--callbacks", type=list[Callback])
+    chosen = {"model": options["model"], "data": options["data"], "callbacks": options["trainer"]["callbacks"]}
+    made = parser.instantiate_classes(parser.parse_object(chosen))
+    made.model.build()
+    return made.model, made.data, made.callbacks
+
+
+def test_no_file_is_without_a_verb() -> None:
+    assert [path.name for path in ALL if not verbs(path)] == []
+
+
+@pytest.mark.parametrize("path", of("generate"))
+def test_a_dataset_s_settings_are_made(path: Path) -> None:
+    parser = GENERATE.parser()
+    values = parse(parser, "generate", own_sections("generate", ["--config", str(path), "--out", "x"]))
+    values = parser.instantiate(values)
+    given = {name: values[name] for name in GenerateSettings.__dataclass_fields__}
+    settings = GenerateSettings(**given)
+    assert settings.name == path.stem
+    assert settings.exclude_testset == (settings.name != "testset-v1")
+
+
+@pytest.mark.parametrize("path", of("fit"))
+def test_a_model_is_built_and_learns_from_a_batch(path: Path, fit_options: Load) -> None:
+    options = fit_options(path)
+    assert options["name"] == path.stem  # where its run is looked for
+    module, _, callbacks = build(options)
+    assert callbacks
+    batch = {
+        "shapes": torch.tensor([[0, 3, -1], [1, 0, 0]]),
+        "poses": torch.randn(2, 3, 6),
+        "mask": torch.tensor([[True, True, False], [True, True, True]]),
+        "silhouette": torch.ones(2, 64, 64),
+        "counts": torch.tensor([[1, 0, 0, 1], [2, 1, 0, 0]]),
+    }
+    loss = module.model.loss(batch, module.draws)[0].mean() if isinstance(module, DDPM) else module._loss(batch)[0]
+    loss.backward()
+    assert loss.isfinite()
+    assert any(p.grad is not None and p.grad.abs().sum() > 0 for p in module.parameters())
+
+
+def test_the_paper_s_denoiser_is_the_paper_s(fit_options: Load) -> None:
+    module, _, _ = build(fit_options(CONFIGS / "model" / "ddpm-paper.yaml"))
+    model = module.model
+    layer = nn.TransformerEncoderLayer(512, 8, 2048, device="meta")
+    assert size(model.denoiser.layers) == 6 * size(layer)
+    assert {block.attention.heads for block in model.denoiser.layers} == {8}
+    assert model.denoiser.encode(torch.zeros(1, 64, 64)).shape == (1, 16, 512)
+    assert size(model.denoiser.head) == 512 * 6 + 6
+    assert size(model) == 20_105_222
+    assert module.max_blocks == 10
+    assert model.config.prediction == "epsilon" and model.config.clip is None
+    beta = model.schedule.beta
+    assert model.schedule.steps == 50
+    assert beta[1].item() == pytest.approx(1e-4) and beta[50].item() == pytest.approx(0.189)
+    assert (beta[2:] - beta[1:-1]).std().item() == pytest.approx(0, abs=1e-12)
+
+
+def test_the_paper_s_classifier_is_the_paper_s(fit_options: Load) -> None:
+    module, _, _ = build(fit_options(CONFIGS / "model" / "blocklist-paper.yaml"))
+    assert isinstance(module, BlockListCNN)
+    network = module.model
+    assert len(network.layers) == 30
+    assert network.stem(torch.zeros(1, 1, 64, 64)).shape == (1, 10, 64, 64)
+    assert network(torch.zeros(1, 64, 64)).shape == (1, 1000)  # 14 over 4 multisets of at most ten, less the empty one
+
+
+def test_quick_has_stacks_for_every_split() -> None:
+    """A template gives five stacks or so; even at ten, each split gets a shard before there are enough."""
+    settings = GenerateSettings(**yaml.safe_load(QUICK.read_text())["generate"])
+    shards = settings.stacks // (10 * settings.templates_per_shard)
+    assert {settings.split_of(shard) for shard in range(shards)} == {"train", "validation", "test"}
+
+
+def test_quick_trains_and_its_run_holds_weights(
+    cli: Cli, towers_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    monkeypatch.chdir(tmp_path)
+    content = yaml.safe_load(QUICK.read_text())
+    options = content["fit"]
+    options["data"]["path"] = str(towers_dataset)
+    options["trainer"] |= {"max_steps": 2, "enable_progress_bar": False, "enable_model_summary": False}
+    for callback in options["trainer"]["callbacks"]:
+        if "every_n_train_steps" in callback["init_args"]:
+            callback["init_args"]["every_n_train_steps"] = 2
+    shorter = tmp_path / "shorter.yaml"
+    shorter.write_text(yaml.safe_dump(content))
+    answer = cli("fit", "--config", shorter)
+    assert answer.code == 0, answer.err
+    sampler = load_sampler(last_checkpoint(Path("runs/quick")))
+    (stacks,) = sampler.sample_batch(np.ones((1, 64, 64), bool), np.array([[2, 0, 0, 0]]), 1, 0)
+    assert stacks[0].names == ["cube", "cube"]
+
+
+def size(module: nn.Module) -> int:
+    return sum(parameter.numel() for parameter in module.parameters())
