@@ -140,7 +140,7 @@ def iou(a: Mask, b: Mask) -> float:
     0.3333333333333333
     """
     union = np.count_nonzero(a | b)
-    return np.count_nonzero(a & b) / union if union else 1.0
+    return float(np.count_nonzero(a & b) / union) if union else 1.0
 
 
 def silhouette_iou(stack: Stack, target: Mask, view: View = "front", grid: Grid = PAPER_GRID) -> float:

@@ -164,12 +164,16 @@ def _build(
     if card.get("kind") not in makers:
         raise StackgenError(f"{weights} holds weights of kind {card.get('kind')!r}, not of a {what}")
     try:
-        catalogue, grid = Catalogue.from_json(card["catalogue"]), Grid(**card["grid"])
-        network, wrap = makers[card["kind"]](card["config"], catalogue, grid, card["max_blocks"])
+        catalogue, grid, max_blocks = (
+            Catalogue.from_json(card["catalogue"]),
+            Grid(**card["grid"]),
+            int(card["max_blocks"]),
+        )
+        network, wrap = makers[card["kind"]](card["config"], catalogue, grid, max_blocks)
         network.load_state_dict(tensors)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise StackgenError(f"{weights}: card and weights do not fit together: {str(error).splitlines()[0]}") from error
-    return wrap(network, catalogue, grid, card["max_blocks"], card)
+    return wrap(network, catalogue, grid, max_blocks, card)
 
 
 Maker = Callable[[dict[str, Any], Catalogue, Grid, int], tuple[nn.Module, Callable[..., Any]]]

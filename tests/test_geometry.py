@@ -234,7 +234,8 @@ def test_iou_of_a_shifted_block(shift: int) -> None:
 @pytest.mark.parametrize("view", VIEWS)
 @pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize(
-    "place", [(3.5, 3.5, 0.5), (-40, -40, 0.5), (0, 40, 7), (0, -40, 60), (0, 40, 1e6), (0, 40, -9), (9, 9, 9), (9, -9, -9)]
+    "place",
+    [(3.5, 3.5, 0.5), (-40, -40, 0.5), (0, 40, 7), (0, -40, 60), (0, 40, 1e6), (0, 40, -9), (9, 9, 9), (9, -9, -9)],
 )
 def test_a_block_that_left_the_canvas_counts_as_outside_the_target(
     view: View, turned: bool, place: tuple[float, float, float]

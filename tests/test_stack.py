@@ -109,7 +109,9 @@ def test_the_paper_s_catalogue_survives_its_plain_form() -> None:
     assert Catalogue.from_json(PAPER_CATALOGUE.to_json()) == PAPER_CATALOGUE
 
 
-@pytest.mark.parametrize("items", [[], [{"name": "x"}], [{"name": "x", "outline": [[1]]}], [1], 3, [{"outline": SQUARE}]])
+@pytest.mark.parametrize(
+    "items", [[], [{"name": "x"}], [{"name": "x", "outline": [[1]]}], [1], 3, [{"outline": SQUARE}]]
+)
 def test_a_malformed_catalogue_is_refused(items: Any) -> None:
     with pytest.raises(StackgenError, match="catalogue"):
         Catalogue.from_json(items)
@@ -206,9 +208,11 @@ def test_any_text_is_a_block_list_or_one_line(text: str) -> None:
     try:
         counts = parse_block_list(text)
     except StackgenError as error:
-        assert "\n" not in str(error)
+        answer = str(error)
     else:
+        answer = format_block_list(counts)
         assert 1 <= counts.sum() <= MAX_BLOCKS and counts.min() >= 0
+    assert answer and "\n" not in answer
 
 
 def test_negative_counts_are_refused_even_if_the_sum_is_right() -> None:

@@ -267,7 +267,7 @@ def test_a_folder_of_other_settings_is_refused_and_left_alone(small: Path) -> No
 
 def test_a_folder_of_unknown_shards_is_refused(small: Path, tmp_path: Path) -> None:
     (tmp_path / "train-000000.tar").write_bytes(next(small.glob("*.tar")).read_bytes())
-    with pytest.raises(StackgenError, match="no generate.json"):
+    with pytest.raises(StackgenError, match=r"no generate\.json"):
         generate(SMALL, tmp_path, workers=1)
     assert [path.name for path in tmp_path.iterdir()] == ["train-000000.tar"]
 
@@ -276,7 +276,7 @@ def test_a_damaged_shard_is_named_and_not_built_upon(small: Path, tmp_path: Path
     for path in small.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     victim = next(tmp_path.glob("*-000001.tar"))
-    victim.write_bytes(victim.read_bytes()[:-3000])
+    victim.write_bytes(victim.read_bytes()[: victim.stat().st_size // 2])
     with pytest.raises(StackgenError, match=victim.name):
         generate(SMALL, tmp_path, workers=1)
 

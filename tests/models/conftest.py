@@ -25,7 +25,8 @@ TINY_CROSS = DenoiserConfig(
 @pytest.fixture(scope="session")
 def arrays() -> StackArrays:
     """Designs as drawn: 40 stacks of 4 to 10 blocks, a template each."""
-    rng, samples = np.random.default_rng(0), []
+    rng = np.random.default_rng(0)
+    samples: list[Sample] = []
     while len(samples) < 40:
         design = draw_template(rng)
         stack = realize(design, rng)

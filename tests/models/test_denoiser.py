@@ -73,7 +73,7 @@ def test_the_paper_s_model_has_the_paper_s_size() -> None:
     assert (config.width, config.layers, config.heads, config.feedforward) == (512, 6, 8, 2048)
     assert (config.conditioning, config.mask_padding, config.ordered) == ("joint", False, False)
     assert len(model.layers) == 6 and len(model.memory_encoder) == 0
-    assert {layer.attention.heads for layer in model.layers} == {8}
+    assert {part.heads for part in model.modules() if isinstance(part, Attention)} == {8}
 
     def linear(i: int, o: int) -> int:
         return i * o + o
@@ -93,7 +93,8 @@ def test_an_encoder_layer_is_torch_s_transformer_encoder_layer() -> None:
         theirs = nn.TransformerEncoderLayer(32, 4, 48, dropout=0.0, batch_first=True, norm_first=norm_first)
         pairs = {
             "self_attn.in_proj_": ours.attention.qkv, "self_attn.out_proj.": ours.attention.out,
-            "linear1.": ours.feedforward[0], "linear2.": ours.feedforward[2], "norm1.": ours.norm1, "norm2.": ours.norm2,
+            "linear1.": ours.feedforward[0], "linear2.": ours.feedforward[2],
+            "norm1.": ours.norm1, "norm2.": ours.norm2,
         }  # fmt: skip
         theirs.load_state_dict({f"{a}{n}": p for a, part in pairs.items() for n, p in part.named_parameters()})
         assert close(ours(x, None), theirs(x))

@@ -47,14 +47,16 @@ class Silent(Oracle):
         return torch.zeros_like(x)
 
 
-def model_for(prediction: Prediction = "epsilon", denoiser: DenoiserConfig = TINY, clip: float | None = None) -> PoseDiffusion:
+def model_for(
+    prediction: Prediction = "epsilon", denoiser: DenoiserConfig = TINY, clip: float | None = None
+) -> PoseDiffusion:
     torch.manual_seed(0)
     model = PoseDiffusion(denoiser, ScheduleConfig(), DiffusionConfig(prediction, clip))
     with torch.no_grad():
         for weight in model.parameters():
             weight.normal_(0, 0.1)
     model.fit_normalization(MEAN, STD)
-    return model.eval()
+    return model.eval().requires_grad_(False)
 
 
 @pytest.fixture
@@ -87,7 +89,7 @@ def test_an_error_of_the_clean_estimate_costs_what_the_algebra_says(batch: dict[
     """delta off: epsilon is off by delta sqrt(abar) / sqrt(1 - abar), v by delta / sqrt(1 - abar)."""
     delta = 0.3
     for prediction in ("epsilon", "v"):
-        model = model_for(prediction)  # type: ignore[arg-type]
+        model = model_for(prediction)
         model.denoiser = Oracle(model, normalised(model, batch), delta)  # type: ignore[assignment]
         losses, t = model.loss(batch, 8, generator())
         bar = model.schedule.alpha_bar[t].float()
@@ -98,7 +100,7 @@ def test_an_error_of_the_clean_estimate_costs_what_the_algebra_says(batch: dict[
 def test_saying_nothing_costs_the_target(batch: dict[str, Tensor]) -> None:
     """A zero estimate: E |epsilon|^2 = 1, and E |v|^2 = abar + (1 - abar) x_0^2, averaged over the real blocks."""
     for prediction in ("epsilon", "v"):
-        model = model_for(prediction)  # type: ignore[arg-type]
+        model = model_for(prediction)
         clean = normalised(model, batch)
         model.denoiser = Silent(model, clean)  # type: ignore[assignment]
         losses, t = model.loss(batch, 400, generator())
@@ -196,25 +198,36 @@ def test_samples_depend_on_the_seed_and_on_nothing_else(denoiser: DenoiserConfig
     assert len({row.tobytes() for row in poses(1)}) == len(poses(1))  # no two blocks alike
 
 
-def test_scenes_do_not_mix(arrays: StackArrays) -> None:
+class Oracles(torch.nn.Module):
+    """An oracle for each batch, in turn."""
+
+    def __init__(self, oracles: list[Oracle]) -> None:
+        super().__init__()
+        self.config, self.oracles, self.turn = oracles[0].config, oracles, -1
+
+    def encode(self, silhouette: Tensor) -> Tensor:
+        self.turn += 1
+        return torch.zeros(len(silhouette), 1, 1)
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        return self.oracles[self.turn](*inputs)
+
+
+@pytest.mark.parametrize("batch_size", [512, 6, 1])
+def test_scenes_do_not_mix(batch_size: int, arrays: StackArrays) -> None:
     """Each scene's blocks go to its own oracle's places, also in several batches."""
-    model = model_for()
-    for batch_size in (512, 6):
-        sampler = DiffusionSampler(model, batch=batch_size)
-        chunk = min(4, batch_size // 3)
-        order = [np.argsort(arrays.shapes[i, : arrays.lengths[i]], kind="stable") for i in range(4)]
-        truth = [arrays.poses[i][o].astype(np.float64) for i, o in enumerate(order)]
-        padded = torch.stack([torch.nn.functional.pad(torch.from_numpy(t), (0, 0, 0, 10 - len(t))) for t in truth])
-        clean = (padded.float() - model.mean) / model.std
-        oracles = iter([Oracle(model, clean[i : i + chunk]) for i in range(0, 4, chunk)])
-        current: list[Oracle] = []
-        model.denoiser = Oracle(model, clean)  # type: ignore[assignment]
-        model.denoiser.encode = lambda s: (current.append(next(oracles)), torch.zeros(len(s), 1, 1))[1]  # type: ignore
-        model.denoiser.forward = lambda *args: current[-1](*args)  # type: ignore[method-assign]
-        scenes = sampler.sample_batch(arrays.images(range(4)), arrays.counts[:4], 3, 0)
-        for scene, expected in zip(scenes, truth, strict=True):
-            for stack in scene:
-                assert stack.poses == pytest.approx(expected, abs=2e-3)
+    model, together = model_for(), max(1, min(4, batch_size // 3))
+    order = [np.argsort(arrays.shapes[i, : arrays.lengths[i]], kind="stable") for i in range(4)]
+    truth = [torch.from_numpy(arrays.poses[i][o]) for i, o in enumerate(order)]
+    clean = torch.stack([torch.nn.functional.pad((t - model.mean) / model.std, (0, 0, 0, 10 - len(t))) for t in truth])
+    oracles = Oracles([Oracle(model, clean[i : i + together]) for i in range(0, 4, together)])
+    model.denoiser = oracles  # type: ignore[assignment]
+    sampler = DiffusionSampler(model, batch=batch_size)
+    scenes = sampler.sample_batch(arrays.images(range(4)), arrays.counts[:4], 3, 0)
+    assert oracles.turn == len(oracles.oracles) - 1
+    for scene, expected in zip(scenes, truth, strict=True):
+        for stack in scene:
+            assert stack.poses == pytest.approx(expected.numpy(), abs=2e-3)
 
 
 def test_the_way_from_noise_is_shown_in_cells(arrays: StackArrays) -> None:

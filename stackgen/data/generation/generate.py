@@ -9,7 +9,6 @@ is started again goes on with those that are missing.
 from __future__ import annotations
 
 import contextlib
-import functools
 import hashlib
 import json
 import multiprocessing
@@ -210,19 +209,13 @@ def _make_shard(settings: GenerateSettings, out: Path, shard: int, excluded: fro
     first = shard * settings.templates_per_shard
     if path.exists():
         return _entry(path)
-    simulator = _simulator(settings.physics, settings.catalogue)
-    samples = [
-        sample
-        for number in range(first, first + settings.templates_per_shard)
-        for sample in template_samples(settings, number, excluded, simulator)
-    ]
+    with Simulator(settings.physics, settings.catalogue) as simulator:
+        samples = [
+            sample
+            for number in range(first, first + settings.templates_per_shard)
+            for sample in template_samples(settings, number, excluded, simulator)
+        ]
     return write_shard(path, samples)
-
-
-@functools.cache
-def _simulator(physics: Physics, catalogue: Catalogue) -> Simulator:
-    """One simulator a worker process: its worlds take seconds to build."""
-    return Simulator(physics, catalogue)
 
 
 def _entry(path: Path) -> dict[str, Any]:
