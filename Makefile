@@ -7,7 +7,7 @@ STAMP := $(VENV)/.installed
 # The first CPython 3.11 that runs; PyBullet has no wheel for later ones. Or: make PYTHON=/path/to/python3.11
 is_311 := import sys; sys.exit(sys.implementation.name != "cpython" or sys.version_info[:2] != (3, 11))
 PYTHON ?= $(shell for p in python3.11 python3 python; do $$p -c '$(is_311)' 2>/dev/null && echo $$p && break; done)
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2
 
 .PHONY: demo test test-all lint setup clean
 

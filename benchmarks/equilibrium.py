@@ -1,12 +1,8 @@
 """How often statics and PyBullet agree, and what statics costs.
 
-    python benchmarks/equilibrium.py --number 200
-    python benchmarks/equilibrium.py --stacks out/arch/stacks.json
-
-Judges settled stacks of a dataset, what is left of them when a block is taken away, and the same
-stacks with noise on every coordinate, which float and interpenetrate a little as a network's samples
-do; or the stacks of files, e.g. samples of a model. Prints a table and every disagreement on settled
-stacks. Times are of the process, so a busy machine only blurs them.
+Judges settled stacks of testset-v1, others of them less a block, and still others with noise on every
+coordinate, which float and interpenetrate a little as a network's samples do; or the stacks of files.
+Times are of the process: on a busy machine they are too long, never too short.
 """
 
 from __future__ import annotations
@@ -14,28 +10,34 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from benchmarks.common import argument_parser, plain_table, report, start
+from stackgen.data.generation.generate import TESTSET
 from stackgen.data.shards import Manifest
 from stackgen.protocols import Verdict
 from stackgen.sim.equilibrium import CONTACT_TOLERANCE, SAFETY, Equilibrium, EquilibriumChecker
 from stackgen.sim.verdict import SimulatorChecker
-from stackgen.stack import Stack
+from stackgen.stack import Stack, StackgenError
 from stackgen.stacks_file import read_stacks
 
-TESTSET = Path(__file__).parents[1] / "stackgen" / "assets" / "testset-v1"
-TOLERANCES = (0.02, 0.05, CONTACT_TOLERANCE, 0.12)
+KINDS = ("settled", "less a block", "shaken")
+TOLERANCES = (0.02, 0.08, 0.2, CONTACT_TOLERANCE, 0.4)
 MOVED = 0.3
-"""A block that the simulator moved further than this [cell] was not held."""
+"""A block that the simulator moved further than this was not held [cell]."""
+
+Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Judged:
-    """A stack and what both say of it."""
+class Case:
+    """A stack, where it came from and what both say of it; statics without a safety margin."""
 
     kind: str
     name: str
@@ -43,36 +45,58 @@ class Judged:
     simulated: Verdict
     statics: Equilibrium
 
+    def said(self, safety: float) -> bool:
+        """Whether statics calls it stable with a safety margin [rad]."""
+        return self.statics.stable and self.statics.margin >= safety
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    options = argument_parser(__name__, __doc__)
+    options.add_argument("--number", type=int, default=200, help="stacks of each kind")
+    options.add_argument("--noise", type=float, default=0.02, help="standard deviation on all coordinates [cell, rad]")
+    options.add_argument("--seed", type=int, default=0, help="of the draw, the removals and the noise")
+    options.add_argument("--files", type=Path, nargs="*", default=[], help="stacks files to judge instead")
+    return options
+
 
 def main() -> None:
-    """Parse, judge, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=TESTSET, help="A dataset.")
-    parser.add_argument("--number", type=int, default=200, help="Stacks of each kind.")
-    parser.add_argument("--noise", type=float, default=0.02, help="On each coordinate of the shaken ones [cell, rad].")
-    parser.add_argument("--seed", type=int, default=0, help="Of the draw, the removals and the noise.")
-    parser.add_argument("--stacks", type=Path, nargs="*", default=(), help="Stacks files to judge instead.")
-    options = parser.parse_args()
-    cases = from_files(options.stacks) if options.stacks else drawn(options)
-    simulator = SimulatorChecker(catalogue=cases[0][2].catalogue)
-    careful, free = EquilibriumChecker(), EquilibriumChecker(safety=0)
-    print(f"contact tolerance {CONTACT_TOLERANCE} cells, safety {math.degrees(SAFETY):.2f} degrees, friction "
-          f"{careful.physics.friction}, {careful.physics.to_json()['engine']}\n")  # fmt: skip
-    judged = [Judged(*case, simulator.check(case[2]), free.equilibrium(case[2])) for case in cases]
-    agreement(judged)
-    blocks_named(judged)
-    tolerances(judged)
-    times(judged, careful)
-    disagreements([case for case in judged if case.kind != "shaken"])
+    """Judge, compare, time."""
+    options = parser().parse_args()
+    if options.number < 1:
+        raise StackgenError("--number must be at least 1")
+    stacks = from_files(options.files) if options.files else drawn(options)
+    simulator, statics = SimulatorChecker(catalogue=stacks[0][2].catalogue), EquilibriumChecker(safety=0)
+    cases = [Case(*named, simulator.check(named[2]), statics.equilibrium(named[2])) for named in stacks]
+    figures: dict[str, Any] = {
+        "physics": simulator.physics.to_json(),
+        "contact_tolerance": CONTACT_TOLERANCE,
+        "safety": SAFETY,
+        "agreement": agreement(cases),
+        "tolerances": tolerances(cases),
+        "unheld": unheld(cases),
+        "milliseconds": times([case.stack for case in cases]),
+        "disagreements": disagreements(cases),
+    }
+    report("equilibrium", figures, tables(figures), options.out)
+
+
+def from_files(files: Sequence[Path]) -> list[tuple[str, str, Stack]]:
+    """The stacks of stacks files."""
+    return [
+        (str(file), f"{file.name} {number}", stack)
+        for file in files
+        for number, stack in enumerate(read_stacks(file).stacks, 1)
+    ]
 
 
 def drawn(options: argparse.Namespace) -> list[tuple[str, str, Stack]]:
-    """Settled stacks, other ones less a block, and still other ones shaken."""
-    manifest = Manifest.load(options.data)
-    samples = [sample for split in ("train", "test") for sample in manifest.samples(options.data, split)]  # type: ignore[arg-type]
+    """Stacks of each kind, drawn anew for each."""
+    manifest = Manifest.load(TESTSET)
+    samples = list(manifest.samples(TESTSET, "test"))
     rng = np.random.default_rng(options.seed)
-    cases = []
-    for kind in ("settled", "less a block", "shaken"):
+    found = []
+    for kind in KINDS:
         for i in rng.choice(len(samples), min(options.number, len(samples)), replace=False):
             stack = samples[i].stack(manifest.catalogue)
             if kind == "less a block":
@@ -80,116 +104,149 @@ def drawn(options: argparse.Namespace) -> list[tuple[str, str, Stack]]:
                 stack = Stack(stack.shapes[keep], stack.poses[keep], stack.catalogue)
             elif kind == "shaken":
                 stack = stack.with_poses(stack.poses + rng.normal(0, options.noise, stack.poses.shape))
-            cases.append((kind, samples[i].key, stack))
-    return cases
-
-
-def from_files(files: Iterable[Path]) -> list[tuple[str, str, Stack]]:
-    """The stacks of stacks files."""
-    return [
-        (file.name, f"{file.name} {number}", stack)
-        for file in files
-        for number, stack in enumerate(read_stacks(file).stacks, 1)
-    ]
-
-
-def kinds(judged: list[Judged]) -> dict[str, list[Judged]]:
-    """By kind, and all settled ones together."""
-    names = dict.fromkeys(case.kind for case in judged)
-    groups = {name: [case for case in judged if case.kind == name] for name in names}
-    if {"settled", "less a block"} <= set(groups):
-        groups["both of these"] = groups["settled"] + groups["less a block"]
-    return groups
-
-
-def agreement(judged: list[Judged]) -> None:
-    """Print the table of verdicts, without and with the safety margin."""
-    print("| stacks | n | stand in PyBullet | safety | agree | false stable | false unstable |")
-    print("| --- | --- | --- | --- | --- | --- | --- |")
-    for kind, cases in kinds(judged).items():
-        truth = np.array([case.simulated.stable for case in cases])
-        for safety in (0.0, SAFETY):
-            said = np.array([case.statics.stable and case.statics.margin >= safety for case in cases])
-            shares = [truth == said, said & ~truth, ~said & truth]
-            print(f"| {kind} | {len(cases)} | {truth.mean():.1%} | {math.degrees(safety):.1f}° | "
-                  + " | ".join(f"{share.mean():.1%}" for share in shares) + " |")  # fmt: skip
-
-
-def blocks_named(judged: list[Judged]) -> None:
-    """Print how well the unheld blocks are those that the simulator moved."""
-    pairs = [
-        (case.statics.unheld, np.abs(case.simulated.settled.poses - case.stack.poses)[:, :3].max(axis=1) > MOVED)
-        for case in judged
-        if not case.statics.stable and not case.simulated.stable
-    ]
-    if not pairs:
-        return
-    named, moved = (np.concatenate(flags) for flags in zip(*pairs, strict=True))
-    exact = np.mean([np.array_equal(a, b) for a, b in pairs])
-    print(f"\nOf {len(pairs)} stacks that fall by both: {(named & moved).sum() / named.sum():.0%} of the blocks named as "
-          f"unheld moved by more than {MOVED} cells, {(named & moved).sum() / moved.sum():.0%} of those that moved were "
-          f"named, exactly the right ones in {exact:.0%} of the stacks.")  # fmt: skip
-
-
-def tolerances(judged: list[Judged]) -> None:
-    """Print the agreement by contact tolerance, with the safety margin on."""
-    print("\n| stacks | contact tolerance | agree | false stable | false unstable |")
-    print("| --- | --- | --- | --- | --- |")
-    for kind, cases in kinds(judged).items():
-        truth = np.array([case.simulated.stable for case in cases])
-        for tolerance in TOLERANCES:
-            checker = EquilibriumChecker(contact_tolerance=tolerance)
-            said = np.array([checker.check(case.stack).stable for case in cases])
-            shares = [truth == said, said & ~truth, ~said & truth]
-            print(f"| {kind} | {tolerance} | " + " | ".join(f"{share.mean():.1%}" for share in shares) + " |")
-
-
-def times(judged: list[Judged], checker: EquilibriumChecker) -> None:
-    """Print what a verdict costs, on this machine now."""
-    stacks = [case.stack for case in judged]
-    eight = [stack for stack in stacks if len(stack) == 8] or stacks
-    whole = _milliseconds(checker.check, stacks)
-    print(f"\nVerdict and margin: {np.mean(whole):.2f} ms a stack of {np.mean([len(s) for s in stacks]):.1f} blocks in "
-          f"the mean, {np.mean(_milliseconds(checker.check, eight)):.2f} ms of {len(eight[0])}; with the push "
-          f"{np.mean(_milliseconds(lambda s: checker.equilibrium(s, True), stacks[:50])):.0f} ms. "
-          f"Here 100,000 Python additions take {_yardstick():.1f} ms.\n")  # fmt: skip
-
-
-def _milliseconds(work: Callable[[Stack], object], stacks: list[Stack], repeats: int = 3) -> list[float]:
-    """Process time for each stack, the best of some."""
-    found = []
-    for stack in stacks:
-        best = math.inf
-        for _ in range(repeats):
-            start = time.process_time()
-            work(stack)
-            best = min(best, time.process_time() - start)
-        found.append(best * 1e3)
+            found.append((kind, samples[i].key, stack))
     return found
 
 
-def _yardstick() -> float:
-    """Process time of a loop that says how fast the machine is just now [ms]."""
+def groups(cases: Sequence[Case]) -> dict[str, list[Case]]:
+    """By kind, and the first two kinds together: neither floats."""
+    by_kind = {kind: [case for case in cases if case.kind == kind] for kind in dict.fromkeys(c.kind for c in cases)}
+    if set(KINDS) <= set(by_kind):
+        by_kind["settled and less a block"] = by_kind[KINDS[0]] + by_kind[KINDS[1]]
+    return by_kind
+
+
+def compared(said: Flags, truth: Flags) -> dict[str, float]:
+    """Shares of all stacks."""
+    return {
+        "agree": float((said == truth).mean()),
+        "false_stable": float((said & ~truth).mean()),
+        "false_unstable": float((~said & truth).mean()),
+    }
+
+
+def simulated(cases: Sequence[Case]) -> Flags:
+    """(n,) what PyBullet says."""
+    return np.array([case.simulated.stable for case in cases])
+
+
+def agreement(cases: Sequence[Case]) -> list[dict[str, Any]]:
+    """Of the verdicts, without and with the safety margin."""
+    return [
+        {
+            "stacks": kind,
+            "number": len(some),
+            "stand": float(simulated(some).mean()),
+            "safety": safety,
+            **compared(np.array([case.said(safety) for case in some]), simulated(some)),
+        }
+        for kind, some in groups(cases).items()
+        for safety in (0.0, SAFETY)
+    ]
+
+
+def tolerances(cases: Sequence[Case]) -> list[dict[str, Any]]:
+    """Agreement by contact tolerance, with the safety margin."""
+    rows = []
+    for tolerance in TOLERANCES:
+        checker = EquilibriumChecker(contact_tolerance=tolerance)
+        for kind, some in groups(cases).items():
+            said = np.array([checker.check(case.stack).stable for case in some])
+            rows.append({"stacks": kind, "tolerance": tolerance, **compared(said, simulated(some))})
+    return rows
+
+
+def unheld(cases: Sequence[Case]) -> dict[str, Any]:
+    """How well the blocks named are those that the simulator moved, where both see a fall."""
+    pairs = [
+        (case.statics.unheld, np.abs(case.simulated.settled.poses - case.stack.poses)[:, :3].max(axis=1) > MOVED)
+        for case in cases
+        if not case.statics.stable and not case.simulated.stable
+    ]
+    if not pairs:
+        return {"stacks": 0}
+    named, moved = (np.concatenate(flags) for flags in zip(*pairs, strict=True))
+    return {
+        "stacks": len(pairs),
+        "named_that_moved": float((named & moved).sum() / named.sum()),
+        "moved_that_were_named": float((named & moved).sum() / moved.sum()),
+        "exactly_right": float(np.mean([np.array_equal(a, b) for a, b in pairs])),
+    }
+
+
+def times(stacks: Sequence[Stack]) -> dict[str, Any]:
+    """Of a verdict with its margin, by number of blocks, and of the push."""
+    checker = EquilibriumChecker()
+    each = np.array([milliseconds(lambda s=stack: checker.check(s)) for stack in stacks])  # type: ignore[misc]
+    sizes = np.array([len(stack) for stack in stacks])
+    pushed = [milliseconds(lambda s=stack: checker.equilibrium(s, True)) for stack in stacks[:50]]  # type: ignore[misc]
+    return {
+        "mean": float(each.mean()),
+        "by_blocks": {int(size): float(each[sizes == size].mean()) for size in np.unique(sizes)},
+        "with_push": float(np.mean(pushed)),
+        "yardstick_100000_additions": milliseconds(lambda: sum(i for i in range(100_000)), repeats=20),
+    }
+
+
+def milliseconds(work: Callable[[], object], repeats: int = 5) -> float:
+    """Process time, the best of some [ms]."""
     best = math.inf
-    for _ in range(10):
-        start, total = time.process_time(), 0
-        for i in range(100_000):
-            total += i
-        best = min(best, time.process_time() - start)
-    return best * 1e3
+    for _ in range(repeats):
+        begin = time.process_time()
+        work()
+        best = min(best, time.process_time() - begin)
+    return 1e3 * best
 
 
-def disagreements(judged: list[Judged]) -> None:
-    """Print every settled stack on which the two differ."""
-    for case in judged:
-        said = case.statics.stable and case.statics.margin >= SAFETY
-        if said != case.simulated.stable:
-            moved = np.abs(case.simulated.settled.poses - case.stack.poses)[:, :3].max()
-            print(f"- {case.kind} {case.name}: statics {'stands' if said else 'falls'} "
-                  f"(margin {math.degrees(case.statics.margin):.2f}°, unheld {np.flatnonzero(case.statics.unheld).tolist()}), "
-                  f"PyBullet {'stands' if case.simulated.stable else 'falls'} (fell "
-                  f"{np.flatnonzero(case.simulated.fell).tolist()}, largest move {moved:.2f} cells)")  # fmt: skip
+def disagreements(cases: Sequence[Case]) -> list[dict[str, Any]]:
+    """Every stack on which the two differ, with the safety margin."""
+    return [
+        {
+            "stacks": case.kind,
+            "name": case.name,
+            "statics": "stands" if case.said(SAFETY) else "falls",
+            "pybullet": "stands" if case.simulated.stable else "falls",
+            "margin_degrees": math.degrees(case.statics.margin),
+            "largest_move_cells": float(np.abs(case.simulated.settled.poses - case.stack.poses)[:, :3].max(initial=0)),
+        }
+        for case in cases
+        if case.said(SAFETY) != case.simulated.stable
+    ]
+
+
+def tables(figures: dict[str, Any]) -> list[Any]:
+    """What is printed."""
+    shares = ("agree", "false_stable", "false_unstable")
+    percent = [f"{name.replace('_', ' ')} [%]" for name in shares]
+    verdicts = [
+        [r["stacks"], str(r["number"]), f"{100 * r['stand']:.1f}", f"{math.degrees(r['safety']):.1f}"]
+        + [f"{100 * r[share]:.1f}" for share in shares]
+        for r in figures["agreement"]
+    ]
+    by_tolerance = [
+        [r["stacks"], f"{r['tolerance']:.2f}"] + [f"{100 * r[share]:.1f}" for share in shares]
+        for r in figures["tolerances"]
+    ]
+    costs = figures["milliseconds"]
+    spent = [[f"{size} blocks", f"{value:.2f}"] for size, value in costs["by_blocks"].items()]
+    spent += [[name.replace("_", " "), f"{costs[name]:.2f}"] for name in costs if name != "by_blocks"]
+    listed = [
+        [f"{r['stacks']} {r['name']}", r["statics"], r["pybullet"]]
+        + [f"{r['margin_degrees']:.2f}", f"{r['largest_move_cells']:.2f}"]
+        for r in figures["disagreements"]
+    ]
+    named = [[name.replace("_", " "), f"{value:.3g}"] for name, value in figures["unheld"].items()]
+    compared_headings = ("stacks", "number", "stand [%]", "safety [degree]", *percent)
+    tolerance_headings = ("stacks", "tolerance [cell]", *percent)
+    listed_headings = ("stack", "statics", "PyBullet", "margin [degree]", "largest move [cell]")
+    return [
+        plain_table("Agreement with PyBullet", compared_headings, verdicts),
+        plain_table("By contact tolerance, with the safety margin", tolerance_headings, by_tolerance),
+        plain_table("Blocks named as unheld, where both see a fall", ("what", "value"), named),
+        plain_table("Process time of a verdict with its margin", ("what", "[ms]"), spent),
+        plain_table("Disagreements, with the safety margin", listed_headings, listed),
+    ]
 
 
 if __name__ == "__main__":
-    main()
+    start(main)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.geometry import PAPER_GRID, Grid, Mask, silhouette_iou
-from stackgen.images import read_silhouette
+from stackgen.images import grid_offset, read_silhouette
 from stackgen.protocols import BlockListPredictor, StabilityChecker, StackSampler
 from stackgen.stack import (
     MAX_BLOCKS,
@@ -160,15 +160,21 @@ class Model:
     def _scene(self, silhouette: Silhouette, blocks: BlockList | None) -> tuple[Mask, NDArray[np.int64]]:
         """Target (H, W) and block list (S,)."""
         mask = self.read(silhouette)
-        counts = self.predictor.predict(mask[None], top=1)[0, 0] if blocks is None else self.counts(blocks)
-        return mask, counts
+        if blocks is not None:
+            return mask, self.counts(blocks)
+        aligned = np.roll(mask, grid_offset(mask, self.grid), axis=1)
+        return mask, self.predictor.predict(aligned[None], top=1)[0, 0]
 
     def _draw(self, mask: Mask, counts: NDArray[np.int64], num_samples: int, seed: int) -> list[Stack]:
         if num_samples < 1:
             raise StackgenError(f"the number of samples must be at least 1, got {num_samples}")
         if not 0 <= seed < 2**63:
             raise StackgenError(f"the seed must be a whole number of at least 0, got {seed}")
-        return self.sampler.sample_batch(mask[None], counts[None], num_samples, seed)[0]
+        # The sampler sees the structure on the cells of its grid; what it answers moves back.
+        offset = grid_offset(mask, self.grid)
+        stacks = self.sampler.sample_batch(np.roll(mask, offset, axis=1)[None], counts[None], num_samples, seed)[0]
+        back = np.array([-offset / self.grid.pixels_per_cell, 0, 0, 0, 0, 0])
+        return [stack.with_poses(stack.poses + back) for stack in stacks]
 
     @cached_property
     def predictor(self) -> BlockListPredictor:

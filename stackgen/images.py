@@ -276,3 +276,32 @@ def _overlap(edges: NDArray[np.float64], length: int) -> NDArray[np.float64]:
     low, high = edges[:-1, None], edges[1:, None]
     cells = np.arange(length)
     return np.clip(np.minimum(high, cells + 1) - np.maximum(low, cells), 0, None) / (high - low)
+
+
+def grid_offset(silhouette: Mask, grid: Grid = PAPER_GRID) -> int:
+    """By how many pixels to shift a silhouette so that its upright edges fall on the grid's cell lines.
+
+    Stacks of the generator stand on the cells of the grid, so samplers trained on them know edges there
+    and nowhere else; a drawing is centred, which puts a structure of odd width half a cell beside. At
+    most half a cell; of equally good offsets the smallest.
+
+    >>> picture = np.zeros((64, 64), dtype=bool)
+    >>> picture[4:60, 25:39] = True  # a tower, one cell wide, in the middle
+    >>> abs(grid_offset(picture))
+    7
+    """
+    steps = np.diff(silhouette.astype(np.int8), axis=1, prepend=0, append=0)
+    edges = np.abs(steps).sum(axis=0)  # number of rows with an edge left of each column
+    places = np.arange(len(edges)) - grid.image_size / 2
+    filled = np.flatnonzero(silhouette.any(axis=0))
+    half = round(grid.pixels_per_cell / 2)
+    best, best_score = 0, -np.inf
+    for offset in sorted(range(-half, half + 1), key=abs):
+        if filled.size and not (0 <= filled[0] + offset and filled[-1] + offset < grid.image_size):
+            continue
+        phase = (places + offset) / grid.pixels_per_cell
+        distance = np.abs(phase - np.round(phase)) * grid.pixels_per_cell  # [pixel] to the next cell line
+        score = float((edges * np.maximum(0, 2 - distance)).sum())
+        if score > best_score + 1e-9:
+            best, best_score = offset, score
+    return best

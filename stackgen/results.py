@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rich.box import SIMPLE
 from rich.table import Table
 
 from stackgen.files import write_atomically
@@ -23,6 +24,8 @@ TRUE_LIST, PREDICTED_LIST = "ground truth", "predicted"
 TOP = 3
 """How many block lists a predictor is asked for; the first is built from, the rest count for top 3."""
 
+_LISTS = {TRUE_LIST: "true list", PREDICTED_LIST: "predicted"}
+
 PAPER_ROWS = {
     TRUE_LIST: {"stability": 84.20, "diversity": 66.87, "front_iou": 74.39, "avg_iou": 71.31},
     PREDICTED_LIST: {"stability": 85.20, "diversity": 64.53, "front_iou": 75.08, "avg_iou": 71.84},
@@ -34,9 +37,9 @@ HEADINGS = {
     "diversity": "diversity",
     "front_iou": "front IoU",
     "avg_iou": "avg IoU",
-    "valid_diversity": "valid div.",
-    "iou_given_stable": "IoU | stable",
-    "front_iou_before_physics": "front IoU before",
+    "valid_diversity": "valid diversity",
+    "iou_given_stable": "IoU if stable",
+    "front_iou_before_physics": "IoU as generated",
 }
 
 
@@ -166,22 +169,21 @@ def _sample_rows(scene: SceneResult) -> Iterator[dict[str, Any]]:
 
 
 def format_table(rows: Sequence[Evaluation]) -> Table:
-    """The rows as a table for the terminal, in percent, the paper's own below them."""
+    """A column for each row of the protocol, in percent, the paper's own to their right; it fits 80 characters."""
     table = Table(
-        title="Mean and 95 % interval, clustered by scene [%]",
+        title="Mean [%], 95 % interval clustered by scene",
         caption="The paper's figures come from its own data and physics.",
+        box=SIMPLE,
     )
-    for heading in ("method", "block list", "scenes x samples"):
-        table.add_column(heading)
-    for heading in HEADINGS.values():
-        table.add_column(heading, justify="right")
+    table.add_column("\nblock list\nscenes x samples")
     for row in rows:
         size = f"{len(row.scenes)} x {row.num_samples}"
-        table.add_row(row.method, row.block_list, size, *(_percent(row.estimate(name)) for name in HEADINGS))
-    table.add_section()
-    for source, figures in PAPER_ROWS.items():
-        cells = [f"{figures[name]:.2f}" if name in figures else "" for name in HEADINGS]
-        table.add_row("StackGen, paper", source, "500 x 3", *cells, style="dim")
+        table.add_column(f"{row.method}\n{_LISTS[row.block_list]}\n{size}", justify="right")
+    for source in PAPER_ROWS:
+        table.add_column(f"paper\n{_LISTS[source]}\n500 x 3", justify="right", style="dim")
+    for name, heading in HEADINGS.items():
+        paper = [f"{figures[name]:.2f}" if name in figures else "" for figures in PAPER_ROWS.values()]
+        table.add_row(heading, *(_percent(row.estimate(name), "\n") for row in rows), *paper)
     return table
 
 
@@ -199,7 +201,8 @@ def format_list_table(rows: Sequence[Evaluation]) -> Table | None:
     return table
 
 
-def _percent(estimate: Estimate | None) -> str:
+def _percent(estimate: Estimate | None, between: str = " ") -> str:
     if estimate is None:
         return "-"
-    return f"{100 * estimate.value:.2f} ({100 * estimate.low:.1f}-{100 * estimate.high:.1f})"
+    low, high = f"{100 * estimate.low:.1f}", f"{100 * estimate.high:.1f}"
+    return f"{100 * estimate.value:.2f}{between}{low}-{high}"

@@ -6,6 +6,8 @@ What the other verbs find out stands beside it: `runs/<name>/test_<n>/{config.ya
 from __future__ import annotations
 
 import re
+import subprocess
+from importlib.metadata import version
 from itertools import count
 from pathlib import Path
 
@@ -30,6 +32,21 @@ def new_run(name: str, root: Path = RUNS, kind: str = "version") -> Path:
             continue
         return folder
     raise AssertionError("count() ends never")
+
+
+def code_version() -> str:
+    """The package's version, and the commit where it runs from a git checkout (`+` where that was changed since).
+
+    >>> code_version().split()[0]
+    '0.1.0'
+    """
+    package = version("stackgen")
+    try:
+        git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty=+", "--exclude=*"]
+        commit = subprocess.run(git, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
+        return package
+    return f"{package} {commit}"
 
 
 def last_checkpoint(folder: Path) -> Path:

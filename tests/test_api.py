@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from PIL import Image
 
 import stackgen
 from stackgen.api import Model
-from stackgen.geometry import mirror, silhouette
+from stackgen.geometry import PAPER_GRID, Mask, mirror, silhouette
 from stackgen.stack import Stack, StackgenError
 from stackgen.stacks_file import read_stacks
 from tests.conftest import Cli, TinyWeights
@@ -91,3 +92,28 @@ def test_a_model_without_predictor_asks_for_a_block_list(towers: Model, tower_im
     assert len(alone.sample(tower_image, blocks="cube=1")) == 3
     with pytest.raises(StackgenError, match="give one"):
         alone.sample(tower_image)
+
+
+class Remembers:
+    """A sampler that keeps what it was shown and answers with a cube in the middle of the lowest row it saw."""
+
+    def __init__(self) -> None:
+        self.seen: Mask | None = None
+
+    def sample_batch(
+        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
+    ) -> list[list[Stack]]:
+        self.seen = silhouettes[0]
+        columns = np.flatnonzero(self.seen[59])
+        x = (columns.mean() + 0.5 - PAPER_GRID.image_size / 2) / PAPER_GRID.pixels_per_cell
+        return [[Stack(np.array([0]), np.array([[x, 0, 0.5, 0, 0, 0]]))] * num_samples]
+
+
+def test_the_sampler_sees_the_structure_on_the_cells_of_its_grid_and_the_answer_moves_back() -> None:
+    tower = silhouette(Stack(np.array([0, 0, 0, 0]), np.array([[0, 0, z + 0.5, 0, 0, 0] for z in range(4)])))
+    sampler = Remembers()
+    stacks = Model(sampler).sample(tower, num_samples=1, blocks="cube=4")
+    assert sampler.seen is not None
+    edges = np.flatnonzero(np.diff(sampler.seen[40].astype(int))) + 1 - PAPER_GRID.image_size / 2
+    assert np.all(edges % PAPER_GRID.pixels_per_cell == 0)  # a tower of odd width stands half a cell beside the middle
+    assert abs(stacks[0].poses[0, 0]) < 1e-9  # and yet the answer is where the drawing was

@@ -28,7 +28,8 @@ from tests.conftest import Cli
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 QUICK = CONFIGS / "quick.yaml"
-ALL = sorted(CONFIGS.rglob("*.yaml"))
+OVERLAY = CONFIGS / "warm-start.yaml"  # no configuration of its own
+ALL = sorted(path for path in CONFIGS.rglob("*.yaml") if path != OVERLAY)
 VERB_OF_FOLDER = {"generate": "generate", "model": "fit"}
 
 Load = Callable[[Path], dict[str, Any]]
@@ -70,6 +71,15 @@ def build(options: dict[str, Any]) -> tuple[Any, StackDataModule, list[Callback]
 
 def test_no_file_is_without_a_verb() -> None:
     assert [path.name for path in ALL if not verbs(path)] == []
+
+
+def test_a_warm_start_is_laid_over_a_model(cli: Cli) -> None:
+    base = CONFIGS / "model" / "ddpm-small.yaml"
+    answer = cli("fit", "--config", base, "--config", OVERLAY, "--data.path", "x", "--print_config")
+    printed = yaml.safe_load(answer.out)
+    kinds = [callback["class_path"].rpartition(".")[2] for callback in printed["trainer"]["callbacks"]]
+    assert answer.code == 0 and kinds == ["StartFrom", "EMA", "ModelCheckpoint"]
+    assert printed["model"]["init_args"]["denoiser"]["ordered"] is True
 
 
 @pytest.mark.parametrize("path", of("generate"))

@@ -42,7 +42,8 @@ def snippets(text: str) -> list[Snippet]:
 
 def commands(text: str) -> list[str]:
     """The command lines of a page."""
-    lines = "\n".join(block[2] for block in FENCED.finditer(text) if block[1] == "bash").splitlines()
+    text = "\n".join(block[2] for block in FENCED.finditer(text) if block[1] == "bash")
+    lines = text.replace("\\\n", " ").splitlines()
     return [line.split("  #")[0].strip() for line in lines if line.strip() and not line.startswith("#")]
 
 

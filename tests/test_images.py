@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 
 from stackgen.geometry import Grid, Mask, iou, mirror, silhouette
-from stackgen.images import read_silhouette
+from stackgen.images import grid_offset, read_silhouette
 from stackgen.stack import Stack, StackgenError
 
 LARGE = Grid(image_size=480, pixels_per_cell=100, ground_margin=40)
@@ -288,3 +288,22 @@ def test_a_bad_array_gets_one_line(array: NDArray, trouble: str) -> None:
     with pytest.raises(StackgenError, match=trouble) as caught:
         read_silhouette(array)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("shift", [-6, -3, 0, 2, 5])
+@pytest.mark.parametrize("name", STACKS)
+def test_grid_offset_undoes_a_shift(name: str, shift: int) -> None:
+    stack = stack_of(name)
+    widest = np.ptp(np.flatnonzero(silhouette(stack).any(axis=0))) + 1
+    if widest + 2 * abs(shift) > 64:
+        pytest.skip("does not fit on the canvas")
+    moved = np.roll(silhouette(stack), shift, axis=1)
+    there = np.flatnonzero(silhouette(stack).any(axis=0))[0]
+    phase = (there + shift + grid_offset(moved) - 32) % 14
+    assert min(phase, 14 - phase) <= 1
+
+
+@pytest.mark.parametrize("name", STACKS)
+def test_grid_offset_of_the_mirror_image_is_as_large(name: str) -> None:
+    mask = silhouette(stack_of(name))
+    assert abs(grid_offset(mask[:, ::-1])) == abs(grid_offset(mask))

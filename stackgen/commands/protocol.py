@@ -18,6 +18,7 @@ from stackgen.evaluation import ParallelChecker, SamplerEvaluation, batch_seed, 
 from stackgen.files import write_atomically
 from stackgen.protocols import StabilityChecker
 from stackgen.results import Evaluation, format_list_table, format_table, write_scenes
+from stackgen.runs import code_version
 from stackgen.stack import StackgenError
 from stackgen.stacks_file import Entry, StacksFile, write_stacks
 
@@ -49,9 +50,10 @@ class WeightsUnderTest(pl.LightningModule):
         if num_samples < 1 or workers < 1:
             raise StackgenError("test: num_samples and workers must be at least 1")
         self.weights, self.num_samples, self.seed = weights, num_samples, seed
-        self.predicted_lists, self.method, self.workers = predicted_lists, method or f"StackGen ({weights})", workers
+        self.predicted_lists, self.workers = predicted_lists, workers
         self.predictions: list[tuple[str, StacksFile]] = []
         self.model: Model = load(weights, block_list_weights)
+        self.method = method or (self.model.weights.name if self.model.weights else str(weights))
 
     def checker(self) -> StabilityChecker:
         """PyBullet, on as many processes as were asked for; a rollout ends at the first fall."""
@@ -93,7 +95,9 @@ def run_protocol(trainer: pl.Trainer, subject: WeightsUnderTest, data: StackData
 
     Leaves `metrics.json` and a CSV of every sample in the folder, and a table in the terminal.
     """
-    facts: dict[str, Any] = {"weights": subject.weights}
+    facts: dict[str, Any] = {"weights": subject.weights, "code": code_version()}
+    if subject.model.weights is not None:
+        facts["weights_sha256"] = subject.model.weights.sha256
     if data.test_path.is_dir():
         manifest = Manifest.load(data.test_path)
         facts["dataset"] = {"name": manifest.name, "sha256": manifest.sha256}

@@ -230,7 +230,7 @@ def attend(q: Tensor, k: Tensor, v: Tensor, seen: Tensor | None) -> Tensor:
     """Scaled dot-product attention of (B, H, N, d/H), heads merged again: (B, N, d)."""
     scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)
     if seen is not None:
-        scores = scores.masked_fill(~seen, -1e9)
+        scores = scores.masked_fill(~seen, torch.finfo(scores.dtype).min)
     mixed = scores.softmax(-1) @ v
     return mixed.transpose(1, 2).flatten(2)
 

@@ -164,6 +164,8 @@ class DiffusionSampler:
         Raises:
             StackgenError: If a block list is empty or longer than the model takes, or sizes differ.
         """
+        if num_samples < 1:
+            raise StackgenError(f"the number of samples must be at least 1, got {num_samples}")
         size = self.grid.image_size
         if silhouettes.ndim != 3 or silhouettes.shape[1:] != (size, size) or len(counts) != len(silhouettes):
             raise StackgenError(f"sampling needs silhouettes (B, {size}, {size}) and as many block lists")

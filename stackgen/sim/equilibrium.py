@@ -23,8 +23,9 @@ from stackgen.stack import Stack, StackgenError
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-CONTACT_TOLERANCE = 0.08
-"""Faces up to this far apart touch [cell]: on settled stacks 0.01 does as well, samples of a network float."""
+CONTACT_TOLERANCE = 0.3
+"""Faces up to this far apart touch [cell]. A block that floats sinks onto what is below it: up to half a
+cell, that is no fall. Settled stacks need 0.01; samples of a network, which float, all of it."""
 
 SAFETY = math.radians(0.5)
 """Margin below which a stack is not called stable [rad]."""

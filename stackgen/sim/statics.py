@@ -117,7 +117,7 @@ class Statics:
         matrix[rows:, :columns] = self.allowed
         cost = np.r_[np.zeros(columns), np.ones(2 * rows)]
         solver = _solver(matrix, cost, np.r_[self.needed, np.zeros(limits)], free=columns, inequalities=limits)
-        if not _solve(solver):
+        if not _solve(solver, certain=True):
             raise ArithmeticError("HiGHS found no solution where one is certain")
         return float(solver.getInfo().objective_function_value), _moves(np.array(solver.getSolution().row_dual[:rows]))
 
@@ -201,7 +201,7 @@ def _in_patch(patches: _Patches) -> Floats:
         rows[number, patch, 4] = v  # a normal force f at (u, v) has the torque (v f, -u f)
         rows[number, patch, 5] = -u
     rows[len(sides) + np.arange(c), np.arange(c), 0] = 1
-    return rows.reshape(-1, 6 * c)
+    return rows.reshape(len(sides) + c, 6 * c)
 
 
 def _in_cone(patches: _Patches, friction: float, rough: Flags) -> Floats:
@@ -219,7 +219,7 @@ def _in_cone(patches: _Patches, friction: float, rough: Flags) -> Floats:
     own[:, -2:, 0] *= np.array([max(math.hypot(u, v) for u, v in patches.corners[i]) for i in which])[:, None]
     own[:, -2:, 3] = 1, -1
     rows[np.arange(len(which)), :, which] = own
-    return rows.reshape(-1, 6 * c)
+    return rows.reshape(len(which) * (CONE_SIDES + 2), 6 * c)
 
 
 _SMOOTH = np.array([True, False, False, False, True, True])
@@ -280,10 +280,24 @@ _OPTIONS: dict[str, bool | int | float | str] = {
 }
 
 
-def _solve(solver: highspy.Highs) -> bool:
-    """Whether there is a solution."""
+def _solve(solver: highspy.Highs, certain: bool = False) -> bool:
+    """Whether there is a solution; where one is `certain`, another answer is not believed at once."""
     solver.run()
-    return bool(solver.getModelStatus() == highspy.HighsModelStatus.kOptimal)
+    if solver.getModelStatus() not in (_ANSWERS[:1] if certain else _ANSWERS):
+        solver.clearSolver()  # rounding got in the way: afresh, with all that HiGHS has against that
+        for option, choice in _CAREFUL.items():
+            solver.setOptionValue(option, choice)
+        solver.run()
+    return bool(solver.getModelStatus() == _STATUS.kOptimal)
+
+
+_STATUS = highspy.HighsModelStatus
+_ANSWERS = (_STATUS.kOptimal, _STATUS.kInfeasible, _STATUS.kUnbounded, _STATUS.kUnboundedOrInfeasible)
+_CAREFUL: dict[str, bool | int | float | str] = {
+    "presolve": "on",
+    "simplex_scale_strategy": 2,
+    "dual_simplex_cost_perturbation_multiplier": 1.0,
+}
 
 
 def inradius(furthest: Callable[[Floats], tuple[Floats, Floats]], tolerance: float = 5e-4) -> tuple[float, Floats]:

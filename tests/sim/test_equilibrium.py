@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from stackgen.data.shards import Manifest
-from stackgen.geometry import mirror
+from stackgen.geometry import centers_of_mass, mirror
 from stackgen.sim.contacts import GROUND, Contact, find_contacts
 from stackgen.sim.equilibrium import EquilibriumChecker
 from stackgen.sim.physics import Physics
@@ -258,6 +259,36 @@ def test_no_blocks_stand_and_wrong_settings_are_named() -> None:
     for tolerance, safety in ((0, 0), (2, 0), (0.1, -1), (0.1, 2)):
         with pytest.raises(StackgenError, match="contact_tolerance must lie in"):
             EquilibriumChecker(contact_tolerance=tolerance, safety=safety)
+
+
+def corner_forces_hold(whole: Stack, friction: float = 0.5) -> bool:
+    """The textbook's linear program: a force in each corner of each patch, solved by SciPy."""
+    centers, columns = centers_of_mass(whole), []
+    for contact in find_contacts(whole, FREE.contact_tolerance):
+        across = np.cross(contact.normal, contact.tangent)
+        signs = [(0, 0)] if contact.upright else [(1, 1), (1, -1), (-1, 1), (-1, -1)]
+        for point in contact.points:
+            for a, b in signs:
+                force = contact.normal + friction * (a * contact.tangent + b * across)
+                column = np.zeros((len(whole), 6))
+                column[contact.block] = np.r_[force, np.cross(point - centers[contact.block], force)]
+                if contact.by != GROUND:
+                    column[contact.by] = -np.r_[force, np.cross(point - centers[contact.by], force)]
+                columns.append(column.ravel())
+    needed = np.zeros((len(whole), 6))
+    needed[:, 2] = [whole.catalogue[shape].volume for shape in whole.shapes]
+    return bool(linprog(np.zeros(len(columns)), A_eq=np.array(columns).T, b_eq=needed.ravel()).status == 0)
+
+
+def test_forces_of_patches_exist_where_forces_at_their_corners_do() -> None:
+    rng = np.random.default_rng(2)
+    held = []
+    for whole in shaken(60):
+        noisy = whole.with_poses(whole.poses + rng.normal(0, 0.02, whole.poses.shape))
+        for one in (whole, noisy):
+            held.append(corner_forces_hold(one))
+            assert FREE.equilibrium(one).stable == held[-1]
+    assert 20 < sum(held) < 100
 
 
 # Symmetries.
