@@ -29,11 +29,13 @@ class DiffusionConfig:
         least_std: Lower bound of the standard deviation that a dimension is divided by [cell, rad].
             Settled stacks hardly vary in y and in rotation; without a bound the rare slanted block
             would be hundreds of standard deviations away.
+        variance: Of the sampler's noise: `beta` (paper) or `posterior`, see samplers.ancestral.
     """
 
     prediction: Literal["epsilon", "v"] = "epsilon"
     clip: float | None = None
     least_std: float = 0.0
+    variance: Literal["beta", "posterior"] = "beta"
 
 
 class PoseDiffusion(nn.Module):
@@ -123,7 +125,9 @@ class PoseDiffusion(nn.Module):
 
         shown = None if callback is None else (lambda t, x: callback(t, x * self.std + self.mean))
         noise = torch.randn((*shapes.shape, POSE), generator=generator, device=generator.device)
-        x = ancestral(predict, noise.to(shapes.device), self.schedule, generator, self.config.clip, shown)
+        posterior = self.config.variance == "posterior"
+        start = noise.to(shapes.device)
+        x = ancestral(predict, start, self.schedule, generator, self.config.clip, posterior, shown)
         return x * self.std + self.mean
 
 
