@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -51,6 +52,11 @@ def cli(capsys: pytest.CaptureFixture[str]) -> Cli:
         return Answer(code, out, err)
 
     return run
+
+
+def allow_interrupts() -> None:
+    """For a child that is to be interrupted: a test run in the background would pass on that Ctrl-C is ignored."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 class TowerSampler:

@@ -20,7 +20,7 @@ from PIL import Image
 from stackgen.api import Model
 from stackgen.cli import explain
 from stackgen.stack import StackgenError
-from tests.conftest import CHILD, Answer, Cli, TinyWeights, stacks_json
+from tests.conftest import CHILD, Answer, Cli, TinyWeights, allow_interrupts, stacks_json
 
 
 def assert_one_line(answer: Answer, *words: str) -> None:
@@ -268,6 +268,7 @@ def test_ctrl_c_is_one_line_and_130(tmp_path: Path) -> None:
         text=True,
         start_new_session=True,
         env=CHILD,
+        preexec_fn=allow_interrupts,
     )
     while not out.is_dir():
         assert process.poll() is None

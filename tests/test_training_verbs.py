@@ -17,7 +17,7 @@ import yaml
 from stackgen.runs import last_checkpoint
 from stackgen.stacks_file import read_stacks
 from stackgen.weights import load_sampler
-from tests.conftest import CHILD, Cli, TinyWeights
+from tests.conftest import CHILD, Cli, TinyWeights, allow_interrupts
 
 CONFIG = """
 name: tiny
@@ -96,6 +96,7 @@ def test_a_run_that_was_stopped_goes_on(blow: signal.Signals, cli: Cli, config: 
         stdout=subprocess.DEVNULL,
         text=True,
         env={**CHILD, "WANDB_MODE": "disabled"},
+        preexec_fn=allow_interrupts,
     )
     last = Path("runs/tiny/version_0/checkpoints/last.ckpt")
     while not last.exists():
