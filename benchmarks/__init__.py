@@ -3,6 +3,7 @@
     python -m benchmarks.cold_start --out docs/results/cold_start.json
     python -m benchmarks.training_speed --out docs/results/training_speed.json
     python -m benchmarks.simulator --out docs/results/simulator.json
+    python -m benchmarks.brute_force --out docs/results/brute_force.json
 
 Each prints what it found and on which machine. Figures are for reading: nothing here passes or fails.
 """

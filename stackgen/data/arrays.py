@@ -1,18 +1,21 @@
 """A split of a dataset as a few arrays: what training reads, and the compact file that travels.
 
-Needs numpy and torch alone: no shard reader beyond the standard library's tar, no simulator.
+Needs numpy and torch alone: no shard reader beyond our own, no simulator.
 
 Legend: M stacks, N blocks at most, S shapes, H x W pixels, B stacks in a batch.
 """
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
+import sys
 import zipfile
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,11 +25,17 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from stackgen.data.shards import SPLITS, Manifest, Sample, read_shard
+from stackgen.data.decoding import PADDING, Decoded, Frame
+from stackgen.data.losses import Losses, decode_sound
+from stackgen.data.shards import SPLITS, Sample
+from stackgen.data.sources import Shard, is_folder, is_remote, load_manifest, read_bytes, shards_of
 from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, StackgenError
 
-PADDING = 255
-"""Shape index of the slots after a stack's last block."""
+LONG = 500_000
+"""Samples from which on reading them shows its progress: some ten seconds."""
+
+FIELDS = ("shapes", "poses", "silhouettes", "template")
+"""Of the arrays, and of the compact file."""
 
 Batch = dict[str, Tensor]
 
@@ -117,15 +126,18 @@ class StackArrays:
         return self.tensors.batch(torch.as_tensor(np.asarray(indices, dtype=np.int64)))
 
     @staticmethod
-    def from_shards(
-        paths: Iterable[str | Path], max_blocks: int = MAX_BLOCKS, num_shapes: int = len(PAPER_CATALOGUE)
-    ) -> StackArrays:
-        """Read shards whole, in the order given.
+    def of(decoded: Decoded, frame: Frame) -> StackArrays:
+        """The samples of a shard."""
+        parts = (decoded.shapes, decoded.poses, decoded.silhouettes, decoded.template)
+        return StackArrays(*parts, frame.num_shapes)
 
-        Raises:
-            StackgenError: If there is no sample, or one that has too many blocks.
-        """
-        return StackArrays.from_samples((s for path in paths for s in read_shard(path)), max_blocks, num_shapes)
+    @staticmethod
+    def concatenate(parts: Sequence[StackArrays]) -> StackArrays:
+        """Several as one, in the order given; at least one."""
+        if len(parts) == 1:
+            return parts[0]
+        fields = {name: np.concatenate([getattr(part, name) for part in parts]) for name in FIELDS}
+        return StackArrays(**fields, num_shapes=parts[0].num_shapes)
 
     @staticmethod
     def from_samples(
@@ -153,9 +165,40 @@ class StackArrays:
 
 
 _BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)
-# 8 pixels of each byte; from 256 on, mirrored: a look-up is three times as fast as shifting bits.
-_PIXELS = torch.from_numpy(np.concatenate([_BITS, _BITS[:, ::-1]]).astype(np.float32))
+# 8 pixels of each byte: a look-up is three times as fast as shifting bits.
+_PIXELS = torch.from_numpy(_BITS.astype(np.float32))
+_REVERSED = torch.from_numpy(np.packbits(_BITS[:, ::-1], axis=1)[:, 0])  # the bits of each byte from behind
 _MIRROR = torch.tensor([-1.0, 1.0, 1.0, 1.0, -1.0, -1.0])
+
+
+class Buffers:
+    """Memory for float pictures on the CPU, used again once nobody holds what was made of it.
+
+    64 MB a batch of 4096: to ask the system for them anew costs more than to fill them.
+
+    Args:
+        most: Buffers kept; whoever holds more batches than this gets fresh memory.
+    """
+
+    def __init__(self, most: int = 4) -> None:
+        self._most = most
+        self._kept: deque[NDArray[np.float32]] = deque()
+
+    def take(self, size: int) -> Tensor:
+        """(size,) float32 of any content."""
+        for _ in range(len(self._kept)):
+            buffer = self._kept.popleft()
+            free = sys.getrefcount(buffer) == 2  # by this name and as the argument; a tensor's storage is a third
+            if free and len(buffer) < size:
+                continue  # too small by now: let it go
+            self._kept.append(buffer)
+            if free:
+                return torch.from_numpy(buffer[:size])
+        # numpy asks for huge pages: half the time of torch's fresh memory
+        buffer = np.empty(size, np.float32)
+        if len(self._kept) < self._most:
+            self._kept.append(buffer)
+        return torch.from_numpy(buffer[:size])
 
 
 @dataclass(frozen=True)
@@ -168,6 +211,7 @@ class StackTensors:
         silhouettes: (M, H, W / 8) uint8.
         counts: (M, S) int64.
         template: (M,) int64.
+        buffers: For the pictures of its batches.
     """
 
     shapes: Tensor
@@ -175,17 +219,25 @@ class StackTensors:
     silhouettes: Tensor
     counts: Tensor
     template: Tensor
+    buffers: Buffers = field(default_factory=Buffers, repr=False, compare=False)
 
     @staticmethod
-    def of(arrays: StackArrays) -> StackTensors:
+    def of(arrays: StackArrays, buffers: Buffers | None = None) -> StackTensors:
         """Tensors that share the arrays' memory."""
-        packed = arrays.silhouettes.reshape(len(arrays), arrays.image_size, -1)
-        parts = (arrays.shapes.view(np.int8), arrays.poses, packed, arrays.counts, arrays.template)
-        return StackTensors(*(torch.from_numpy(np.require(part, requirements=["C", "W"])) for part in parts))
+        parts = {
+            "shapes": arrays.shapes.view(np.int8),
+            "poses": arrays.poses,
+            "silhouettes": arrays.silhouettes.reshape(len(arrays), arrays.image_size, arrays.image_size // 8),
+            "counts": arrays.counts,
+            "template": arrays.template,
+        }
+        tensors = {name: torch.from_numpy(np.require(part, requirements=["C", "W"])) for name, part in parts.items()}
+        return StackTensors(**tensors, buffers=buffers or Buffers())
 
     def to(self, device: torch.device | str) -> StackTensors:
         """The same on another device."""
-        return StackTensors(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+        names = ("shapes", "poses", "silhouettes", "counts", "template")
+        return StackTensors(**{name: getattr(self, name).to(device) for name in names}, buffers=self.buffers)
 
     def batch(self, indices: Tensor, mirrored: Tensor | None = None, max_blocks: int | None = None) -> Batch:
         """Gather a batch.
@@ -200,34 +252,38 @@ class StackTensors:
             (B, N) bool, `silhouette` (B, H, W) float32, `counts` (B, S) int64, `template` (B,) int64.
         """
         indices = indices.to(self.shapes.device)
-        shapes = self.shapes[indices, :max_blocks].long()
-        poses = self.poses[indices, :max_blocks]
-        packed = self.silhouettes[indices]
-        pixels = packed.int()
+        shapes = self.shapes.index_select(0, indices)[:, :max_blocks].long()
+        poses = self.poses.index_select(0, indices)[:, :max_blocks]
+        packed = self.silhouettes.index_select(0, indices)
         if mirrored is not None:
             mirrored = mirrored.to(indices.device)
             signs = torch.where(mirrored[:, None], _MIRROR.to(indices.device), 1.0)
             poses = poses * signs[:, None, :]
-            pixels = torch.where(mirrored[:, None, None], pixels.flip(-1) + 256, pixels)
+            chosen = mirrored.nonzero().squeeze(1)
+            backwards = packed.index_select(0, chosen).flip(-1)
+            packed.index_copy_(0, chosen, _look_up(_REVERSED, backwards))
         return {
             "shapes": shapes,
             "poses": poses,
             "mask": shapes >= 0,
-            "silhouette": _unpack(pixels),
-            "counts": self.counts[indices],
-            "template": self.template[indices],
+            "silhouette": self._unpack(packed),
+            "counts": self.counts.index_select(0, indices),
+            "template": self.template.index_select(0, indices),
         }
 
+    def _unpack(self, packed: Tensor) -> Tensor:
+        """(B, H, W / 8) bytes to (B, H, W) float32."""
+        if packed.device.type == "cpu":
+            out = self.buffers.take(8 * packed.numel()).view(-1, 8)
+        else:
+            out = torch.empty((packed.numel(), 8), device=packed.device)
+        torch.index_select(_PIXELS.to(packed.device), 0, packed.reshape(-1).int(), out=out)
+        return out.view(*packed.shape[:2], -1)
 
-def _unpack(pixels: Tensor) -> Tensor:
-    """(B, H, W / 8) rows of the pixel table to (B, H, W) float32."""
-    size = (pixels.numel(), 8)
-    if pixels.device.type == "cpu":  # numpy asks for huge pages: half the time of torch's fresh memory
-        out = torch.from_numpy(np.empty(size, np.float32))
-    else:
-        out = torch.empty(size, device=pixels.device)
-    torch.index_select(_PIXELS.to(pixels.device), 0, pixels.reshape(-1), out=out)
-    return out.reshape(*pixels.shape[:2], -1)
+
+def _look_up(table: Tensor, bytes_: Tensor) -> Tensor:
+    """What a table of 256 entries says of each byte."""
+    return table.to(bytes_.device).index_select(0, bytes_.reshape(-1).int()).view(bytes_.shape)
 
 
 def save_npz(path: str | Path, splits: Mapping[str, StackArrays], manifest: Mapping) -> None:
@@ -245,9 +301,8 @@ def save_npz(path: str | Path, splits: Mapping[str, StackArrays], manifest: Mapp
     names = [name for name in SPLITS if name in splits]
     if not names or len(names) != len(splits) or path.suffix != ".npz":
         raise StackgenError(f"compact dataset: {path} must end in .npz and hold some of {', '.join(SPLITS)}")
-    fields = ("shapes", "poses", "silhouettes", "template")
     parts: dict[str, Any] = {
-        field: np.concatenate([getattr(splits[name], field) for name in names]) for field in fields
+        field: np.concatenate([getattr(splits[name], field) for name in names]) for field in FIELDS
     }
     parts["split"] = np.repeat(
         np.array([SPLITS.index(name) for name in names], np.uint8), [len(splits[name]) for name in names]
@@ -270,12 +325,12 @@ def load_npz(path: str | Path) -> tuple[dict[str, StackArrays], dict]:
     Raises:
         StackgenError: If the file is missing, broken, or not such a file.
     """
+    if not is_remote(path) and not Path(path).exists():
+        raise StackgenError(f"no dataset at {path}")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            fields = {name: file[name] for name in ("shapes", "poses", "silhouettes", "template")}
+        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as file:
+            fields = {name: file[name] for name in FIELDS}
             split, manifest = file["split"], json.loads(str(file["manifest"]))
-    except FileNotFoundError as error:
-        raise StackgenError(f"no dataset at {path}") from error
     except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         raise StackgenError(f"{path} is not a compact stackgen dataset: {_one_line(error)}") from error
     if not isinstance(manifest, dict) or split.shape != fields["template"].shape:
@@ -288,15 +343,19 @@ def load_npz(path: str | Path) -> tuple[dict[str, StackArrays], dict]:
 def load_dataset(path: str | Path, splits: Iterable[str] = SPLITS) -> tuple[dict[str, StackArrays], dict]:
     """The splits asked for, as far as they exist, and the manifest, of a dataset folder or a compact file.
 
+    Args:
+        path: Local, or as :mod:`stackgen.data.sources` says.
+        splits: Their names.
+
     Raises:
-        StackgenError: If it is neither, or has none of the splits.
+        StackgenError: If it is neither, has none of the splits, or a shard is damaged (the message names it).
     """
-    path, wanted = Path(path), tuple(splits)
-    if path.is_dir():
-        manifest = Manifest.load(path)
-        sizes = (manifest.max_blocks, len(manifest.catalogue))
-        shards = {str(name): manifest.paths(path, name) for name in SPLITS if name in wanted}
-        found = {name: StackArrays.from_shards(files, *sizes) for name, files in shards.items() if files}
+    wanted = tuple(splits)
+    if is_folder(path):
+        manifest, losses = load_manifest(path), Losses()
+        shards = {str(name): shards_of(manifest, path, name) for name in SPLITS if name in wanted}
+        found = {name: _fill(those, Frame.of(manifest), losses) for name, those in shards.items() if those}
+        losses.report(str(path))
         facts = manifest.to_json()
     else:
         everything, facts = load_npz(path)
@@ -304,6 +363,28 @@ def load_dataset(path: str | Path, splits: Iterable[str] = SPLITS) -> tuple[dict
     if not found:
         raise StackgenError(f"dataset {path} has no {' or '.join(wanted)} split")
     return found, facts
+
+
+def _fill(shards: Sequence[Shard], frame: Frame, losses: Losses) -> StackArrays:
+    """All samples of some shards; damage to one is an error, since it is found before anything was begun."""
+    parts = []
+    for shard in _tracked(shards):
+        decoded, lost = decode_sound(shard.read(), shard, frame)
+        losses.add(lost)
+        parts.append(StackArrays.of(decoded, frame))
+    arrays = StackArrays.concatenate(parts)
+    if not len(arrays):
+        raise StackgenError("dataset: the shards hold no sample")
+    return arrays
+
+
+def _tracked(shards: Sequence[Shard]) -> Iterable[Shard]:
+    """The shards, with a progress bar if reading them takes a while."""
+    if sum(shard.samples for shard in shards) < LONG and not is_remote(shards[0].path):
+        return shards
+    from rich.progress import track  # only where it is needed
+
+    return track(shards, "reading shards", transient=True)
 
 
 def _one_line(error: Exception) -> str:

@@ -1,14 +1,13 @@
 """The one way data reaches training: batches from memory, or streamed from shards.
 
-The whole of a paper-sized dataset is 150 MB as arrays, so by default it is held in memory (on the
-accelerator, where there is one) and batches are gathered there; streaming is for what does not fit.
+The whole of a paper-sized dataset is 150 MB as arrays, so it is held in memory (on the accelerator,
+where there is one) and batches are gathered there; streaming is for what does not fit.
 What a batch holds: :meth:`stackgen.data.arrays.StackTensors.batch`.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,178 +16,38 @@ import torch
 from numpy.typing import NDArray
 
 from stackgen._lightning import pl
-from stackgen.data.arrays import Batch, StackArrays, StackTensors, load_dataset
+from stackgen.data.arrays import Batch, StackArrays, load_dataset
+from stackgen.data.cached import CachedLoader
+from stackgen.data.decoding import Frame
+from stackgen.data.epochs import Epochs
+from stackgen.data.losses import Losses, read_decoded
 from stackgen.data.shards import Manifest, Split
+from stackgen.data.sources import is_folder, load_manifest, shards_of
 from stackgen.geometry import Grid
 from stackgen.stack import Catalogue, StackgenError
+
+__all__ = ["TESTSET", "CachedLoader", "StackDataModule"]
 
 TESTSET = Path(__file__).parents[1] / "assets" / "testset-v1"
 """The frozen test scenes that every method is measured on."""
 
-Indices = NDArray[np.int64]
-Place = tuple[int, int]
-
-
-def process_place() -> Place:
-    """(rank, world size) of this process; (0, 1) outside distributed training."""
-    if torch.distributed.is_available() and torch.distributed.is_initialized():
-        return torch.distributed.get_rank(), torch.distributed.get_world_size()
-    return 0, 1
-
-
-def training_batches(
-    buckets: Iterable[Indices], batch_size: int, rng: np.random.Generator, place: Place = (0, 1)
-) -> list[Indices]:
-    """One pass over the samples in random order, each batch from one bucket.
-
-    All processes get the same number of batches, without overlap, and at any time batches of the
-    same bucket, so that none waits for another's longer stacks. What is left of a bucket after its
-    last whole batch waits for another pass, which leaves out others; a bucket smaller than one batch
-    is one batch.
-
-    Args:
-        buckets: Indices of the samples of each bucket.
-        batch_size: Of each process.
-        rng: In the same state on every process.
-        place: Rank and world size.
-    """
-    rank, world = place
-    together = batch_size * world
-    groups: list[Indices] = []
-    for bucket in buckets:
-        order = rng.permutation(bucket)
-        whole = len(order) // together * together or len(order) // world * world
-        groups += [order[start : min(start + together, whole)] for start in range(0, whole, together)]
-    return [groups[i][rank::world] for i in rng.permutation(len(groups))]
-
-
-def exact_batches(count: int, batch_size: int, place: Place = (0, 1)) -> list[Indices]:
-    """Every sample once, in order: equal numbers of batches on all processes, without overlap.
-
-    Raises:
-        StackgenError: If there are fewer samples than processes.
-    """
-    rank, world = place
-    if count < world:
-        raise StackgenError(f"{count} samples cannot be shared by {world} processes; use fewer")
-    share = np.arange(rank, count, world)
-    # As many as the longest share needs, but none empty: batches of one may so become batches of two.
-    batches = min(math.ceil(math.ceil(count / world) / batch_size), count // world)
-    return np.array_split(share, batches)
-
-
-class CachedLoader:
-    """Batches gathered from a split in memory; what they are depends on seed and epoch alone.
-
-    Training: an epoch is one pass, or the next `samples_per_epoch` of an endless row of passes.
-    Otherwise every sample once, in order.
-
-    Args:
-        arrays: The split.
-        batch_size: Samples a batch, on each process.
-        train: Shuffle, as :func:`training_batches` does.
-        bucket_by_blocks: Batches of stacks with one number of blocks, their padding trimmed away.
-        mirror: Reflect each sample at x = 0 in half of the passes.
-        samples_per_epoch: Over all processes; None for one pass.
-        seed: Of order and reflections.
-        epoch: Asked for the epoch's number at its start; by default epochs are counted.
-        device: Asked for the device that holds split and batches.
-        place: Asked for rank and world size.
-    """
-
-    def __init__(
-        self,
-        arrays: StackArrays,
-        batch_size: int,
-        *,
-        train: bool,
-        bucket_by_blocks: bool = False,
-        mirror: bool = False,
-        samples_per_epoch: int | None = None,
-        seed: int = 0,
-        epoch: Callable[[], int] | None = None,
-        device: Callable[[], torch.device] = lambda: torch.device("cpu"),
-        place: Callable[[], Place] = process_place,
-    ) -> None:
-        self.arrays, self.batch_size, self.train = arrays, batch_size, train
-        self.bucket_by_blocks, self.mirror, self.samples_per_epoch = bucket_by_blocks, mirror, samples_per_epoch
-        self.seed, self.place = seed, place
-        self._epoch, self._device = epoch, device
-        self._tensors: StackTensors | None = None
-        self._passed = 0  # epochs begun
-        self._position = {"epoch": -1, "batches": 0}  # where the last iteration is
-        self._resume: dict[str, int] | None = None
-        lengths = arrays.lengths if bucket_by_blocks else np.zeros(len(arrays), np.int64)
-        self._buckets = [np.flatnonzero(lengths == k) for k in np.unique(lengths)]
-        if train and not len(self._pass(0)):
-            raise StackgenError(f"{len(arrays)} training samples are too few for {place()[1]} processes")
-
-    def __len__(self) -> int:
-        """Batches an epoch on this process."""
-        if not self.train:
-            return len(exact_batches(len(self.arrays), self.batch_size, self.place()))
-        if self.samples_per_epoch is not None:
-            return max(1, self.samples_per_epoch // (self.batch_size * self.place()[1]))
-        return len(self._pass(0))
-
-    def __iter__(self) -> Iterator[Batch]:
-        epoch = self._epoch() if self._epoch else self._passed
-        self._passed = epoch + 1
-        # After a resume in the middle of an epoch, go on where it was left.
-        done = self._resume["batches"] if self._resume and self._resume["epoch"] == epoch else 0
-        self._resume = None
-        tensors = self._on_device()
-        batches = self._training(epoch, done) if self.train else self._exact(done)
-        for batches_done, (indices, mirrored) in enumerate(batches, done + 1):
-            self._position = {"epoch": epoch, "batches": batches_done}
-            longest = int(self.arrays.lengths[indices].max()) if self.bucket_by_blocks else None
-            flags = None if mirrored is None else torch.from_numpy(mirrored)
-            yield tensors.batch(torch.from_numpy(indices), flags, longest)
-
-    def state_dict(self) -> dict[str, int]:
-        """Where the epoch is; Lightning keeps it in its checkpoints."""
-        return dict(self._position)
-
-    def load_state_dict(self, state: dict[str, int]) -> None:
-        """Let the next iteration, if of the same epoch, go on from there."""
-        self._resume = {"epoch": int(state["epoch"]), "batches": int(state["batches"])}
-
-    def _exact(self, done: int) -> Iterator[tuple[Indices, None]]:
-        for indices in exact_batches(len(self.arrays), self.batch_size, self.place())[done:]:
-            yield indices, None
-
-    def _training(self, epoch: int, done: int) -> Iterator[tuple[Indices, NDArray[np.bool_] | None]]:
-        """The epoch's stretch of the endless row of passes."""
-        length, a_pass = len(self), len(self._pass(0))
-        number, batches = -1, []
-        for i in range(epoch * length + done, (epoch + 1) * length):
-            if i // a_pass != number:
-                number = i // a_pass
-                batches = self._pass(number)
-                flips = np.random.default_rng([self.seed, number, 1]).random(len(self.arrays)) < 0.5
-            indices = batches[i % a_pass]
-            yield indices, flips[indices] if self.mirror else None
-
-    def _pass(self, number: int) -> list[Indices]:
-        rng = np.random.default_rng([self.seed, number, 0])
-        return training_batches(self._buckets, self.batch_size, rng, self.place())
-
-    def _on_device(self) -> StackTensors:
-        device = self._device()
-        if self._tensors is None or self._tensors.shapes.device != device:
-            self._tensors = self.arrays.tensors.to(device)
-        return self._tensors
+STATISTICS_SHARDS = 8
+"""Shards, spread over the split, from which a stream learns the scale of the poses."""
 
 
 class StackDataModule(pl.LightningDataModule):
     """Training, validation and test data of one dataset.
 
     Args:
-        path: Dataset folder or compact `.npz` file.
+        path: Dataset folder or compact `.npz` file; also behind a URL (`s3://`, `https://`, ...) or a command
+            (`pipe:ssh host cat data/{file}`).
         batch_size: Samples a batch, on each process.
-        mode: `cached` holds the splits in memory; `stream` reads shards as it goes.
-        num_workers: Reading processes, in mode `stream` (training).
-        bucket_by_blocks: Training batches of stacks with one number of blocks, padding trimmed.
+        mode: `cached` holds the splits in memory, filled once; `stream` reads shards as it goes; `auto`
+            caches what takes no more than `cache_gb`.
+        cache_gb: See `mode`; training and validation split together, on each process [GB].
+        num_workers: Reading processes, where data are streamed.
+        bucket_by_blocks: Training batches of stacks with one number of blocks (nearly one, where they are
+            streamed), padding trimmed.
         mirror: Reflect training samples at x = 0 half of the time.
         samples_per_epoch: Of training, over all processes; by default as many as there are.
         eval_batch_size: Of validation and test; by default `batch_size`.
@@ -203,7 +62,8 @@ class StackDataModule(pl.LightningDataModule):
         self,
         path: str | Path,
         batch_size: int = 256,
-        mode: Literal["cached", "stream"] = "cached",
+        mode: Literal["auto", "cached", "stream"] = "auto",
+        cache_gb: float = 2.0,
         num_workers: int = 0,
         bucket_by_blocks: bool = False,
         mirror: bool = False,
@@ -215,25 +75,29 @@ class StackDataModule(pl.LightningDataModule):
         super().__init__()
         if batch_size < 1 or (eval_batch_size or 1) < 1 or (samples_per_epoch or 1) < 1:
             raise StackgenError("data: batch_size, eval_batch_size and samples_per_epoch must be at least 1")
+        if num_workers < 0 or cache_gb < 0:
+            raise StackgenError("data: num_workers and cache_gb must not be negative")
         if mode == "cached" and num_workers:
             raise StackgenError("data: num_workers is for mode stream; cached batches need no worker")
-        self.path, self.test_path = Path(path), Path(test_path or TESTSET)
+        self.path, self.test_path = str(path), str(test_path or TESTSET)
         self.batch_size, self.eval_batch_size = batch_size, eval_batch_size or batch_size
-        self.mode, self.num_workers, self.seed = mode, num_workers, seed
+        self.mode, self.cache_gb, self.num_workers, self.seed = mode, cache_gb, num_workers, seed
         self.bucket_by_blocks, self.mirror, self.samples_per_epoch = bucket_by_blocks, mirror, samples_per_epoch
         self.splits: dict[str, StackArrays] = {}
-        self._manifest: dict[str, Any] | None = None
+        self._facts: dict[str, dict[str, Any]] = {}  # manifests as plain data, by path
+        self._manifests: dict[str, Manifest] = {}
+        self._training: Epochs | None = None
+        self._resume: dict[str, Any] | None = None
 
     @property
     def manifest(self) -> dict[str, Any]:
         """The dataset's manifest as plain data."""
-        if self._manifest is None:
-            if self.path.is_dir():
-                self._manifest = Manifest.load(self.path).to_json()
-            else:
-                self._load("train", "validation")
-        assert self._manifest is not None
-        return self._manifest
+        return self._manifest_of(self.path, "train", "validation")
+
+    @property
+    def test_manifest(self) -> dict[str, Any]:
+        """The manifest of the dataset whose test split is used."""
+        return self._manifest_of(self.test_path, "test")
 
     @property
     def catalogue(self) -> Catalogue:
@@ -246,20 +110,42 @@ class StackDataModule(pl.LightningDataModule):
         return Grid(**self.manifest["grid"])
 
     def pose_statistics(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Mean (6,) and standard deviation (6,) of the training poses; when streaming, of the first shard's."""
-        if self.mode == "cached":
-            arrays = self.split("train")
-        else:
-            paths = Manifest.load(self.path).paths(self.path, "train")[:1]
-            arrays = StackArrays.from_shards(paths, self.manifest["max_blocks"], len(self.catalogue))
+        """Mean (6,) and standard deviation (6,) of the training poses; when streaming, of a few shards'."""
+        if self.is_cached("train"):
+            return self.split("train").pose_statistics(self.mirror)
+        manifest, losses = self._manifest_object(self.path), Losses()
+        shards, frame = shards_of(manifest, self.path, "train"), Frame.of(manifest)
+        parts = []
+        for number in np.unique(np.linspace(0, len(shards) - 1, STATISTICS_SHARDS).astype(int)):
+            decoded, lost = read_decoded(shards[number], frame)
+            losses.add(lost)
+            parts.append(StackArrays.of(decoded, frame))
+        arrays = StackArrays.concatenate(parts)
+        if not len(arrays):
+            raise StackgenError(f"data: none of {len(parts)} training shards of {self.path} can be read")
         return arrays.pose_statistics(self.mirror)
+
+    def is_cached(self, split: Split) -> bool:
+        """Whether a split is held in memory; the same on every process and machine."""
+        path = self.test_path if split == "test" else self.path
+        if self.mode == "cached" or not is_folder(path):
+            return True
+        if self.mode == "stream":
+            return False
+        manifest = self._manifest_object(path)
+        splits: tuple[Split, ...] = ("train", "validation") if split == "train" else (split,)
+        samples = sum(map(manifest.count, splits))
+        return samples * Frame.of(manifest).bytes_per_sample <= self.cache_gb * 1e9
 
     def setup(self, stage: str) -> None:
         """Load what the stage needs."""
         if self.mirror and not all(_is_symmetric(shape.outline) for shape in self.catalogue):
             raise StackgenError("data: mirror needs shapes whose outlines are symmetric; set mirror to false")
-        if self.mode == "cached" and stage == "fit":
-            self._load("train", "validation")
+        if stage == "fit":
+            splits: tuple[Split, ...] = ("train", "validation")
+            if self.mode == "stream" and self.is_cached("train"):
+                raise StackgenError(f"data: mode stream needs a dataset of shards; {self.path} is no such folder")
+            self._load(*(name for name in splits if self.is_cached(name)))
 
     def split(self, name: str) -> StackArrays:
         """A split in memory.
@@ -273,32 +159,29 @@ class StackDataModule(pl.LightningDataModule):
             raise StackgenError(f"dataset {self.path} has no {name} split")
         return self.splits[name]
 
-    def train_dataloader(self) -> Iterable[Batch]:
+    def train_dataloader(self) -> Epochs:
         """Shuffled batches."""
-        if self.mode == "stream":
+        options: dict[str, Any] = {
+            "bucket_by_blocks": self.bucket_by_blocks,
+            "mirror": self.mirror,
+            "samples_per_epoch": self.samples_per_epoch,
+            "seed": self.seed,
+            "epoch": self._epoch(),
+            "device": self._device,
+        }
+        if self.is_cached("train"):
+            self._training = CachedLoader(self.split("train"), self.batch_size, train=True, **options)
+        else:
             from stackgen.data.streaming import TrainingStream
 
-            return TrainingStream(
-                self.path,
-                self.batch_size,
-                num_workers=self.num_workers,
-                bucket_by_blocks=self.bucket_by_blocks,
-                mirror=self.mirror,
-                samples_per_epoch=self.samples_per_epoch,
-                seed=self.seed,
-                epoch=self._epoch(),
-            )
-        return CachedLoader(
-            self.split("train"),
-            self.batch_size,
-            train=True,
-            bucket_by_blocks=self.bucket_by_blocks,
-            mirror=self.mirror,
-            samples_per_epoch=self.samples_per_epoch,
-            seed=self.seed,
-            epoch=self._epoch(),
-            device=self._device,
-        )
+            self._training = TrainingStream(self.path, self.batch_size, num_workers=self.num_workers, **options)
+        if self._resume is not None:
+            self._training.load_state_dict(self._resume)
+            self._resume = None
+        if self._training.relaid and self.trainer is not None:
+            # The epoch under way has a length of its own: let Lightning ask again for the next one.
+            self.trainer.reload_dataloaders_every_n_epochs = 1  # type: ignore[attr-defined]
+        return self._training
 
     def val_dataloader(self) -> Iterable[Batch]:
         """The validation split once, in order."""
@@ -312,22 +195,44 @@ class StackDataModule(pl.LightningDataModule):
         """The same as for the test."""
         return self.test_dataloader()
 
-    def _exact_loader(self, path: Path, split: Split) -> Iterable[Batch]:
-        if self.mode == "stream" and path.is_dir():
-            from stackgen.data.streaming import ExactStream
+    def state_dict(self) -> dict[str, Any]:
+        """Where training is, for checkpoints."""
+        return {} if self._training is None else {"training": self._training.state_dict()}
 
-            return ExactStream(path, split, self.eval_batch_size)
-        return CachedLoader(self.split(split), self.eval_batch_size, train=False, device=self._device)
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Let training go on from there; before Lightning asks how long an epoch is."""
+        self._resume = state.get("training")
+
+    def _exact_loader(self, path: str, split: Split) -> Iterable[Batch]:
+        if self.is_cached(split):
+            return CachedLoader(self.split(split), self.eval_batch_size, train=False, device=self._device)
+        from stackgen.data.streaming import ExactStream
+
+        return ExactStream(path, split, self.eval_batch_size, num_workers=self.num_workers, device=self._device)
 
     def _load(self, *names: str) -> None:
         """Read splits, all that are missing from one file at once."""
         missing = [name for name in names if name not in self.splits]
         ours = [name for name in missing if name != "test"]
         if ours:
-            found, self._manifest = load_dataset(self.path, ours)
+            found, self._facts[self.path] = load_dataset(self.path, ours)
             self.splits.update(found)
         if "test" in missing:
-            self.splits.update(load_dataset(self.test_path, ("test",))[0])
+            found, self._facts[self.test_path] = load_dataset(self.test_path, ("test",))
+            self.splits.update(found)
+
+    def _manifest_of(self, path: str, *splits: str) -> dict[str, Any]:
+        if path not in self._facts:
+            if is_folder(path):
+                self._facts[path] = self._manifest_object(path).to_json()
+            else:
+                self._load(*splits)
+        return self._facts[path]
+
+    def _manifest_object(self, path: str) -> Manifest:
+        if path not in self._manifests:
+            self._manifests[path] = load_manifest(path)
+        return self._manifests[path]
 
     def _epoch(self) -> Callable[[], int] | None:
         trainer = self.trainer

@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import re
 import tarfile
 import tokenize
 from collections.abc import Iterable, Iterator, Mapping
@@ -28,6 +29,28 @@ from stackgen.stack import Catalogue, Stack, StackgenError
 FORMAT = "stackgen.dataset/1"
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = ("train", "validation", "test")
+PROGRESS, PARTS = "progress", "parts"
+"""Folders within a dataset that is not complete yet: the record of whole shards, and what is drawn from."""
+_GOLDEN = 0.6180339887498949
+_SHARD_NAME = re.compile(rf"(?:{'|'.join(SPLITS)})-(\d+)\.tar")
+
+
+def split_of(number: int, validation: float, test: float, offset: float = 0.0) -> Split:
+    """The split of the `number`-th part of a dataset; shares are met evenly along the way (multiples of the
+    golden ratio).
+
+    Args:
+        number: From 0 on.
+        validation, test: Shares of these splits; what is left is for training.
+        offset: In [0, 1): another one, another choice.
+
+    >>> [split_of(number, 0.1, 0.2) for number in range(6)]
+    ['validation', 'train', 'test', 'train', 'train', 'validation']
+    """
+    place = (number * _GOLDEN + offset) % 1
+    if place < validation:
+        return "validation"
+    return "test" if place < validation + test else "train"
 
 
 @dataclass(frozen=True)
@@ -127,13 +150,34 @@ class Manifest:
         """
         path = Path(folder) / "dataset.json"
         try:
-            data = json.loads(path.read_text())
+            return Manifest.parse(path.read_bytes(), path)
         except FileNotFoundError as error:
             raise StackgenError(
                 f"no dataset at {folder}: there is no dataset.json in it; make one with `stackgen generate`"
             ) from error
-        except (OSError, ValueError) as error:
+        except OSError as error:
+            raise StackgenError(f"{path} cannot be read: {error.strerror or error}") from error
+
+    @staticmethod
+    def parse(content: bytes, path: str | Path) -> Manifest:
+        """A manifest from the bytes of its file; `path` is what errors call it.
+
+        Raises:
+            StackgenError: If it is not one of ours.
+        """
+        try:
+            data = json.loads(content)
+        except ValueError as error:
             raise StackgenError(f"{path} is not readable as JSON: {error}") from error
+        return Manifest.from_json(data, path)
+
+    @staticmethod
+    def from_json(data: Any, path: str | Path = "manifest") -> Manifest:
+        """Inverse of :meth:`to_json`; `path` is what errors call it.
+
+        Raises:
+            StackgenError: If it is not the plain form of one of ours.
+        """
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise StackgenError(f"{path} is not a {FORMAT} manifest")
         try:
@@ -156,20 +200,58 @@ def manifest_sha256(manifest: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(manifest, sort_keys=True).encode()).hexdigest()
 
 
-def write_shard(path: Path, samples: Iterable[Sample]) -> dict[str, Any]:
-    """Write one tar; returns its manifest entry (file, split, samples, sha256)."""
-    buffer, count = io.BytesIO(), 0
+def encode_shard(samples: Iterable[Sample]) -> bytes:
+    """The tar of some samples: equal stacks, equal bytes."""
+    buffer = io.BytesIO()
     with tarfile.open(fileobj=buffer, mode="w", format=tarfile.USTAR_FORMAT) as tar:
         for sample in samples:
-            count += 1
             for suffix, content in _members(sample):
                 info = tarfile.TarInfo(f"{sample.key}.{suffix}")
                 info.size = len(content)
                 tar.addfile(info, io.BytesIO(content))
-    content = buffer.getvalue()
+    return buffer.getvalue()
+
+
+def shard_entry(name: str, content: bytes, samples: int) -> dict[str, Any]:
+    """What a manifest says of a shard.
+
+    >>> shard_entry("train-000003.tar", b"", 0)["split"]
+    'train'
+    """
+    sha256 = hashlib.sha256(content).hexdigest()
+    return {"file": name, "split": name.rpartition("-")[0], "samples": samples, "sha256": sha256}
+
+
+def shard_number(name: str) -> int:
+    """Number of a shard by its file name.
+
+    Raises:
+        StackgenError: If that is not how shards are called.
+
+    >>> shard_number("train-000003.tar")
+    3
+    """
+    match = _SHARD_NAME.fullmatch(name)
+    if match is None:
+        raise StackgenError(f"{name!r} is not the name of a shard: they are called SPLIT-NUMBER.tar")
+    return int(match[1])
+
+
+def write_shard(path: Path, samples: Iterable[Sample]) -> dict[str, Any]:
+    """Write one tar; returns its manifest entry (file, split, samples, sha256)."""
+    those = list(samples)
+    content = encode_shard(those)
     write_atomically(path, content)
-    split = path.name.rpartition("-")[0]
-    return {"file": path.name, "split": split, "samples": count, "sha256": hashlib.sha256(content).hexdigest()}
+    return shard_entry(path.name, content, len(those))
+
+
+def is_whole(path: Path, sha256: str) -> bool:
+    """Whether a shard is there and has the checksum that the manifest names; its samples are not decoded."""
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest() == sha256
+    except FileNotFoundError:
+        return False
 
 
 def read_shard(path: str | Path, sha256: str | None = None) -> Iterator[Sample]:
@@ -185,13 +267,18 @@ def read_shard(path: str | Path, sha256: str | None = None) -> Iterator[Sample]:
     try:
         content = Path(path).read_bytes()
         if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
-            raise ValueError("its checksum is not the one in dataset.json")
-        yield from _decode_tar(content)
+            raise ValueError("its checksum is not the one in dataset.json (`stackgen dataset repair` makes it again)")
+        yield from iterate_shard(content)
     except (OSError, tarfile.TarError, KeyError, ValueError, EOFError, tokenize.TokenError) as error:
         raise StackgenError(f"shard {path} is missing or damaged: {' '.join(str(error).split())}") from error
 
 
-def _decode_tar(content: bytes) -> Iterator[Sample]:
+def iterate_shard(content: bytes) -> Iterator[Sample]:
+    """The samples of a tar, from its bytes.
+
+    Raises:
+        tarfile.TarError, KeyError, ValueError, EOFError, tokenize.TokenError: As damaged bytes may have it.
+    """
     members: dict[str, bytes] = {}
     with tarfile.open(fileobj=io.BytesIO(content), mode="r:") as tar:
         for member in tar:

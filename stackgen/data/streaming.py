@@ -1,135 +1,124 @@
 """Batches read from shards as they are needed, for datasets that do not fit in memory.
 
-Training resamples shards without end, so that no process ever waits for another's last shard;
-validation and test pass over every sample once. What cannot be read is skipped, counted and
-reported when the epoch ends.
+Reading processes fetch shards, compare their checksums, decode and shuffle; what they hand over is
+packed, 800 bytes a stack, and becomes a batch in the process that trains. What cannot be read is
+skipped, named, counted and reported when the epoch ends (:mod:`stackgen.data.losses`); in training
+others take its place, so that every process has as many batches as it would have had.
 """
 
 from __future__ import annotations
 
-import multiprocessing
-import random
-import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from itertools import islice
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-import webdataset as wds
+from numpy.typing import NDArray
+from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from stackgen.data.arrays import Batch, StackArrays
-from stackgen.data.datamodule import Place, exact_batches, process_place
-from stackgen.data.shards import Manifest, Sample, Split, decode_sample
+from stackgen.data.arrays import Batch, Buffers, StackArrays, StackTensors
+from stackgen.data.decoding import Decoded, Frame
+from stackgen.data.epochs import Epochs
+from stackgen.data.losses import Loss, Losses, read_decoded
+from stackgen.data.order import Cursor, Deal, Piece, Place, exact_batches, process_place, shuffled_shards
+from stackgen.data.shards import Split
+from stackgen.data.sources import Shard, load_manifest, shards_of
 from stackgen.stack import StackgenError
 
-SHUFFLE_BUFFER = 5000
-"""Samples held back for shuffling in each reading process: some 10 MB."""
+HOPELESS = 20
+"""Shards in a row that cannot be read, after which nothing readable is expected any more."""
 
-_HOPELESS = 1000  # errors in a row, after which nothing readable is expected any more
-
-
-class Skipped:
-    """Counts what could not be read, over all reading processes; an error handler of webdataset."""
-
-    def __init__(self) -> None:
-        self._count: Any = multiprocessing.Value("q", 0)  # shared memory, also when workers are spawned
-        self._in_a_row = 0
-
-    @property
-    def count(self) -> int:
-        """Errors so far."""
-        return int(self._count.value)
-
-    def __call__(self, error: Exception) -> bool:
-        """Count one and go on, unless nothing at all can be read."""
-        self._in_a_row += 1
-        if self._in_a_row > _HOPELESS:
-            raise StackgenError(f"no readable sample in {_HOPELESS} attempts; the last error: {error}")
-        with self._count.get_lock():
-            self._count.value += 1
-        return True
-
-    def read_one(self) -> None:
-        """Something could be read."""
-        self._in_a_row = 0
+_CPU = torch.device("cpu")
 
 
 @dataclass(frozen=True)
-class _Decoder:
-    """Raw members to a checked sample."""
-
-    max_blocks: int
-    num_shapes: int
-    image_size: int
-    skipped: Skipped
-
-    def __call__(self, raw: dict[str, Any]) -> Sample:
-        sample = decode_sample(raw["__key__"], raw)
-        k = len(sample.shapes)
-        if sample.poses.shape != (k, 6) or not np.isfinite(sample.poses).all():
-            raise ValueError(f"sample {sample.key}: {k} shapes do not fit poses {sample.poses.shape}")
-        if not 1 <= k <= self.max_blocks or sample.shapes.max() >= self.num_shapes:
-            raise ValueError(f"sample {sample.key}: more blocks or shapes than the dataset's manifest says")
-        if sample.silhouette.shape != (self.image_size, self.image_size):
-            raise ValueError(f"sample {sample.key}: silhouette of {sample.silhouette.shape} pixels")
-        self.skipped.read_one()
-        return sample
-
-    def collate(self, samples: list[Sample], mirrored: np.ndarray | None = None, trim: bool = False) -> Batch:
-        """A batch of samples; `trim` cuts it to the longest of them."""
-        arrays = StackArrays.from_samples(samples, self.max_blocks, self.num_shapes)
-        flags = None if mirrored is None else torch.from_numpy(mirrored)
-        return arrays.tensors.batch(torch.arange(len(samples)), flags, int(arrays.lengths.max()) if trim else None)
-
-
-@dataclass(frozen=True)
-class _Batcher:
-    """Samples to batches, each of one bucket; one bucket holds everything if none are asked for."""
-
-    decoder: _Decoder
-    batch_size: int
-    bucket_by_blocks: bool
-    mirror: bool
-    seed: int
-    rank: int
-
-    def __call__(self, samples: Iterable[Sample]) -> Iterator[Batch]:
-        rng = np.random.default_rng([self.seed, _worker_seed(self.rank)])
-        buckets: dict[int, list[Sample]] = {}
-        for sample in samples:
-            bucket = buckets.setdefault(len(sample.shapes) if self.bucket_by_blocks else 0, [])
-            bucket.append(sample)
-            if len(bucket) == self.batch_size:
-                mirrored = rng.random(len(bucket)) < 0.5 if self.mirror else None
-                yield self.decoder.collate(bucket, mirrored, trim=self.bucket_by_blocks)
-                bucket.clear()
-
-
-class TrainingStream:
-    """Endless resampled shards, cut into epochs.
+class Packet:
+    """What a reading process hands over.
 
     Args:
-        folder: With `dataset.json` and shards.
+        arrays: The stacks of a batch; None if this only brings news.
+        mirrored: (B,) bool, which to reflect at x = 0.
+        losses: What could not be read since the last packet.
+        error: Why no more will come.
+    """
+
+    arrays: StackArrays | None = None
+    mirrored: NDArray[np.bool_] | None = None
+    losses: tuple[Loss, ...] = ()
+    error: str | None = None
+
+
+class ShardReader:
+    """Decoded shards of a split, by number; remembers the last one, which two neighbouring windows share.
+
+    Args:
+        shards: Of the split.
+        frame: Of the dataset.
+    """
+
+    def __init__(self, shards: Sequence[Shard], frame: Frame) -> None:
+        self.shards, self.frame = shards, frame
+        self._last: tuple[int, Decoded] | None = None
+        self._losses: list[Loss] = []
+        self._in_vain = 0  # shards in a row without a readable sample
+
+    def read(self, number: int) -> Decoded:
+        """The readable samples of a shard.
+
+        Raises:
+            StackgenError: If none of many shards in a row had any.
+        """
+        if self._last is None or self._last[0] != number:
+            decoded, losses = read_decoded(self.shards[number], self.frame)
+            self._losses += losses
+            self._last = number, decoded
+            self._in_vain = 0 if len(decoded.positions) or not losses else self._in_vain + 1
+            if self._in_vain == HOPELESS:
+                raise StackgenError(f"data: {HOPELESS} shards in a row cannot be read; the last one: {losses[-1].what}")
+        return self._last[1]
+
+    def samples(self, piece: Piece) -> StackArrays:
+        """The readable samples of a piece."""
+        decoded = self.read(piece.shard)
+        first, last = np.searchsorted(decoded.positions, (piece.start, piece.stop))
+        return StackArrays.of(decoded, self.frame).select(slice(first, last))
+
+    def news(self) -> tuple[Loss, ...]:
+        """What was lost since this was last asked."""
+        losses, self._losses = tuple(self._losses), []
+        return losses
+
+
+class TrainingStream(Epochs):
+    """Training batches from shards; see :class:`stackgen.data.epochs.Epochs`.
+
+    A pass visits every sample at most once, over all processes: which shard is read by whom follows
+    from the manifest alone (:class:`stackgen.data.order.Deal`). Resumed under the same layout an epoch
+    goes on with the next sample; under another one, whole windows of about 8 shards are what is not
+    read again.
+
+    Args:
+        path: Of the dataset, wherever it lies.
         batch_size: Samples a batch, on each process.
         num_workers: Reading processes; 0 reads in this one.
-        bucket_by_blocks: Batches of stacks with one number of blocks, padding trimmed.
+        bucket_by_blocks: Batches of stacks with nearly one number of blocks, their padding trimmed away.
         mirror: Reflect samples at x = 0 with probability 1/2.
-        samples_per_epoch: Over all processes; by default as many as the dataset has.
-        seed: With the epoch's number it decides what is read, for a given number of workers.
+        samples_per_epoch: Over all processes; None for one pass.
+        seed: With the epoch's number and the layout it decides what is read.
         epoch: Asked for the epoch's number at its start; by default epochs are counted.
+        device: Asked for the device that the batches are for.
         place: Asked for rank and world size.
 
     Raises:
-        StackgenError: If there are no training shards.
+        StackgenError: If there are no training shards, or fewer samples than processes.
     """
 
     def __init__(
         self,
-        folder: Path,
+        path: str | Path,
         batch_size: int,
         *,
         num_workers: int = 0,
@@ -138,121 +127,228 @@ class TrainingStream:
         samples_per_epoch: int | None = None,
         seed: int = 0,
         epoch: Callable[[], int] | None = None,
+        device: Callable[[], torch.device] = lambda: _CPU,
         place: Callable[[], Place] = process_place,
     ) -> None:
-        manifest = Manifest.load(folder)
-        self.paths = _paths(manifest, folder, "train")
-        self.samples = samples_per_epoch or manifest.count("train")
-        self.batch_size, self.num_workers, self.seed = batch_size, num_workers, seed
-        self.bucket_by_blocks, self.mirror = bucket_by_blocks, mirror
-        self.skipped = Skipped()
-        self._decoder = _decoder(manifest, self.skipped)
-        self._epoch, self._place, self._passed = epoch, place, 0
+        super().__init__(batch_size, samples_per_epoch, seed, epoch, place, max(1, num_workers))
+        self.num_workers, self.bucket_by_blocks, self.mirror = num_workers, bucket_by_blocks, mirror
+        self.frame, self.shards = _open(path, "train")
+        self._unpacker, self._losses = _Unpacker(device), _losses_of(place())
+        self._whole_pass()
 
-    def __len__(self) -> int:
-        """Batches an epoch on this process."""
-        return max(1, self.samples // (self.batch_size * self._place()[1]))
+    def _steps(self, start: Cursor) -> int:
+        return self._dealt(start).steps
 
-    def __iter__(self) -> Iterator[Batch]:
-        epoch = self._epoch() if self._epoch else self._passed
-        self._passed = epoch + 1
-        before = self.skipped.count
-        dataset = self._pipeline(int(np.random.SeedSequence([self.seed, epoch]).generate_state(1)[0]))
-        loader = wds.WebLoader(dataset, batch_size=None, num_workers=self.num_workers)
-        for number, batch in enumerate(loader.with_epoch(len(self)), 1):
-            if number == len(self):  # the trainer does not ask for more than there are, so say it now
-                _report(self.skipped.count - before)
-            yield batch
+    def _deal(self, cursor: Cursor) -> Iterator[Batch]:
+        until = min(cursor.step + cursor.left, self._steps(cursor))
+        reader = _TrainingReader(self, self._dealt(cursor), cursor, until, self.place()[0])
+        packets = _packets(reader, self.num_workers, self._losses)
+        for step, packet in enumerate(packets, cursor.step + 1):
+            if step == until:  # the trainer does not ask for more than there are: now or never
+                packets.close()
+                if step == cursor.step + cursor.left:
+                    self._losses.report(f"epoch {self._passed - 1}")
+            yield self._unpacker.batch(packet, trim=self.bucket_by_blocks)
 
-    def _pipeline(self, seed: int) -> wds.DataPipeline:
-        rank = self._place()[0]
-        return wds.DataPipeline(
-            # Each process and worker draws shards of its own, which splits the endless list between them.
-            wds.ResampledShards(self.paths, seed=seed, worker_seed=partial(_worker_seed, rank), deterministic=True),
-            wds.tarfile_to_samples(handler=self.skipped),
-            partial(_shuffled, seed, rank),
-            wds.map(self._decoder, handler=self.skipped),
-            _Batcher(self._decoder, self.batch_size, self.bucket_by_blocks, self.mirror, seed, rank),
-        )
+    def _dealt(self, cursor: Cursor) -> Deal:
+        """What is left of a pass under earlier layouts, dealt out under the present one."""
+        rng = np.random.default_rng([self.seed, cursor.number, 0])
+        pieces = tuple(shuffled_shards([shard.samples for shard in self.shards], rng))
+        for layout, steps in cursor.dealt[:-1]:
+            pieces = Deal(pieces, layout).unread(steps)
+        return Deal(pieces, cursor.layout)
+
+
+class _TrainingReader(IterableDataset):
+    """One worker's batches of a stretch of a pass."""
+
+    def __init__(self, stream: TrainingStream, deal: Deal, cursor: Cursor, until: int, rank: int) -> None:
+        self.deal, self.after, self.until, self.rank = deal, cursor.step, until, rank
+        self.seeds = [stream.seed, cursor.number, len(cursor.dealt)]
+        self.bucket_by_blocks, self.mirror = stream.bucket_by_blocks, stream.mirror
+        self.reader = ShardReader(stream.shards, stream.frame)
+
+    def __iter__(self) -> Iterator[Packet]:
+        info = get_worker_info()
+        worker = ((info.id if info else 0) + self.after) % self.deal.layout.workers
+        batches = self.deal.worker_batches(worker, self.after, self.until)
+        per_window = self.deal.batches_per_window
+        for window in range(batches.start // per_window, -(-batches.stop // per_window) if len(batches) else 0):
+            samples, groups, flips = self._window(window)
+            first = self.deal.window_batches(window).start
+            for number in self.deal.window_batches(window):
+                if number in batches:
+                    group = groups[number - first]
+                    yield Packet(samples.select(group), flips[group] if self.mirror else None, self.reader.news())
+
+    def _window(self, window: int) -> tuple[StackArrays, list[NDArray[np.int64]], NDArray[np.bool_]]:
+        """The samples of a window, which of them are each batch, and which are mirrored."""
+        samples = self._readable(self.deal.window(self.rank, window))
+        rng = np.random.default_rng([*self.seeds, window, 1 + self.rank])
+        wanted = len(self.deal.window_batches(window)) * self.deal.batch_size
+        order = rng.permutation(len(samples))
+        if len(order) < wanted:  # others of the window in the place of those that could not be read
+            order = np.concatenate([order, rng.integers(len(samples), size=wanted - len(order))])
+        order = order[:wanted]
+        if self.bucket_by_blocks:
+            order = order[np.argsort(samples.lengths[order], kind="stable")]
+        groups = np.split(order, range(self.deal.batch_size, wanted, self.deal.batch_size))
+        # All processes take short and long stacks in the same order, so that none waits for another.
+        turn = np.random.default_rng([*self.seeds, window, 0]).permutation(len(groups))
+        return samples, [groups[i] for i in turn], rng.random(len(samples)) < 0.5
+
+    def _readable(self, pieces: list[Piece]) -> StackArrays:
+        """The samples of some pieces, or if none is readable those of the next shard that has any."""
+        samples = StackArrays.concatenate([self.reader.samples(piece) for piece in pieces])
+        after, count = pieces[-1].shard, len(self.reader.shards)
+        for i in range(1, count + 1):
+            if len(samples):
+                break
+            samples = StackArrays.of(self.reader.read((after + i) % count), self.reader.frame)
+        if not len(samples):
+            raise StackgenError("data: there is no readable sample in any shard; the lines above name the damage")
+        return samples
 
 
 class ExactStream:
-    """Every sample of a split once, in order, shared between the processes without overlap.
+    """Every readable sample of a split once, in order, shared between the processes without overlap.
+
+    Every process reads all shards and keeps its share of the samples. So all know what could not be
+    read, and have the same number of batches nevertheless.
 
     Args:
-        folder: With `dataset.json` and shards.
+        path: Of the dataset, wherever it lies.
         split: Its name.
-        batch_size: Samples a batch, on each process.
+        batch_size: Samples a batch, on each process; a last batch that makes up for losses may have two more.
+        num_workers: 0 reads in this process; more are no faster than the one that keeps the order.
+        device: Asked for the device that the batches are for.
         place: Asked for rank and world size.
 
     Raises:
         StackgenError: If there are no shards of that split.
     """
 
-    def __init__(self, folder: Path, split: Split, batch_size: int, place: Callable[[], Place] = process_place) -> None:
-        manifest = Manifest.load(folder)
-        self.paths = _paths(manifest, folder, split)
-        self.count, self.batch_size = manifest.count(split), batch_size
-        self.skipped = Skipped()
-        self._decoder = _decoder(manifest, self.skipped)
-        self._place = place
-
-    def _sizes(self) -> list[int]:
-        return [len(indices) for indices in exact_batches(self.count, self.batch_size, self._place())]
+    def __init__(
+        self,
+        path: str | Path,
+        split: Split,
+        batch_size: int,
+        *,
+        num_workers: int = 0,
+        device: Callable[[], torch.device] = lambda: _CPU,
+        place: Callable[[], Place] = process_place,
+    ) -> None:
+        self.frame, self.shards = _open(path, split)
+        self.batch_size, self.num_workers, self.place = batch_size, min(num_workers, 1), place
+        self._unpacker, self._losses = _Unpacker(device), Losses()
+        self._what = f"the {split} split"
 
     def __len__(self) -> int:
-        """Batches on this process: the same on all."""
-        return len(self._sizes())
+        """Batches on this process if everything can be read: the same on all."""
+        count = sum(shard.samples for shard in self.shards)
+        return len(exact_batches(count, self.batch_size, self.place()))
 
     def __iter__(self) -> Iterator[Batch]:
-        rank, world = self._place()
-        samples = iter(
-            wds.DataPipeline(
-                wds.SimpleShardList(self.paths),
-                wds.tarfile_to_samples(handler=self.skipped),
-                # By sample and not by shard: equal numbers on all processes, whatever the shards.
-                lambda raw: islice(raw, rank, None, world),
-                wds.map(self._decoder, handler=self.skipped),
-            )
+        losses = self._losses if self.place()[0] == 0 else None  # all processes meet the same
+        packets = _packets(
+            _ExactReader(self.shards, self.frame, self.batch_size, self.place()), self.num_workers, losses
         )
-        sizes, read = self._sizes(), 0
-        for number, size in enumerate(sizes, 1):
-            batch = list(islice(samples, size))
-            read += len(batch)
-            if number == len(sizes):
-                _report(sum(sizes) - read)  # a tar cut between two members ends without an error
-            if batch:
-                yield self._decoder.collate(batch)
+        last: Packet | None = None
+        for packet in chain(packets, [None]):
+            if packet is None and losses is not None:
+                losses.report(self._what)
+            if last is not None:
+                yield self._unpacker.batch(last)
+            last = packet
 
 
-def _paths(manifest: Manifest, folder: Path, split: Split) -> list[str]:
-    paths = [str(path) for path in manifest.paths(folder, split)]
-    if not paths:
-        raise StackgenError(f"dataset {folder} has no {split} split")
-    return paths
+class _ExactReader(IterableDataset):
+    """One process's batches of an exact pass."""
+
+    def __init__(self, shards: Sequence[Shard], frame: Frame, batch_size: int, place: Place) -> None:
+        self.reader = ShardReader(shards, frame)
+        self.rank, self.world = place
+        count = sum(shard.samples for shard in shards)
+        # (ranks, batches) samples that each process has had after each batch, if everything can be read
+        self.planned = np.stack(
+            [
+                np.cumsum([len(batch) for batch in exact_batches(count, batch_size, (rank, self.world))])
+                for rank in range(self.world)
+            ]
+        )
+
+    def __iter__(self) -> Iterator[Packet]:
+        seen, held, taken, number = 0, [], 0, 0
+        for shard in range(len(self.reader.shards)):
+            samples = StackArrays.of(self.reader.read(shard), self.reader.frame)
+            held.append(samples.select(slice((self.rank - seen) % self.world, None, self.world)))
+            seen += len(samples)
+            while number + 1 < self.planned.shape[1] and self._all_have_more(number, seen):
+                size = int(self.planned[self.rank, number]) - taken
+                rest = StackArrays.concatenate(held)
+                held, taken, number = [rest.select(slice(size, None))], taken + size, number + 1
+                yield Packet(rest.select(slice(size)), losses=self.reader.news())
+        if seen < self.world:
+            raise StackgenError(f"data: {seen} readable samples cannot be shared by {self.world} processes")
+        yield Packet(StackArrays.concatenate(held), losses=self.reader.news())
+
+    def _all_have_more(self, number: int, seen: int) -> bool:
+        """Whether every process can have its batch of this number, and something for another one."""
+        shares = [len(range(rank, seen, self.world)) for rank in range(self.world)]
+        return all(share > planned for share, planned in zip(shares, self.planned[:, number], strict=True))
 
 
-def _decoder(manifest: Manifest, skipped: Skipped) -> _Decoder:
-    return _Decoder(manifest.max_blocks, len(manifest.catalogue), manifest.grid.image_size, skipped)
+class _Unpacker:
+    """Packets to batches on a device."""
+
+    def __init__(self, device: Callable[[], torch.device]) -> None:
+        self._device, self._buffers = device, Buffers()
+
+    def batch(self, packet: Packet, trim: bool = False) -> Batch:
+        assert packet.arrays is not None
+        tensors = StackTensors.of(packet.arrays, self._buffers).to(self._device())
+        mirrored = None if packet.mirrored is None else torch.from_numpy(packet.mirrored)
+        longest = int(packet.arrays.lengths.max()) if trim else None
+        return tensors.batch(torch.arange(len(packet.arrays)), mirrored, longest)
 
 
-def _worker_seed(rank: int) -> int:
-    info = torch.utils.data.get_worker_info()
-    return 10_000 * rank + (info.id if info else 0)
+def _packets(reader: IterableDataset, workers: int, losses: Losses | None) -> Generator[Packet, None, None]:
+    """What a reader hands over, read here or by workers that take turns; losses are counted, errors raised."""
+    own = torch.Generator()  # else the loader draws from the stream of numbers that the model draws from
+    loader = DataLoader(_Messages(reader), batch_size=None, num_workers=workers, collate_fn=_unchanged, generator=own)
+    for packet in loader:
+        if losses is not None:
+            losses.add(packet.losses)
+        if packet.error is not None:
+            raise StackgenError(packet.error)
+        if packet.arrays is not None:
+            yield packet
 
 
-def _shuffled(seed: int, rank: int, samples: Iterable[Any]) -> Iterator[Any]:
-    """An endless stream out of order: each sample leaves at random from a full buffer."""
-    rng = random.Random(seed * 1_000_003 + _worker_seed(rank))
-    buffer: list[Any] = []
-    for sample in samples:
-        buffer.append(sample)
-        if len(buffer) >= SHUFFLE_BUFFER:
-            i = rng.randrange(len(buffer))
-            buffer[i], buffer[-1] = buffer[-1], buffer[i]
-            yield buffer.pop()
+class _Messages(IterableDataset):
+    """A reader whose errors arrive as one line: torch would send a traceback in their place."""
+
+    def __init__(self, reader: Any) -> None:
+        self.reader = reader
+
+    def __iter__(self) -> Iterator[Packet]:
+        try:
+            yield from self.reader
+        except StackgenError as error:
+            yield Packet(losses=self.reader.reader.news(), error=str(error))
 
 
-def _report(skipped: int) -> None:
-    if skipped:
-        warnings.warn(f"data: {skipped} broken samples or shards were skipped in this epoch", stacklevel=3)
+def _unchanged(packet: Any) -> Any:
+    return packet
+
+
+def _open(path: str | Path, split: Split) -> tuple[Frame, list[Shard]]:
+    manifest = load_manifest(path)
+    shards = shards_of(manifest, path, split)
+    if not shards:
+        raise StackgenError(f"dataset {path} has no {split} split")
+    return Frame.of(manifest), shards
+
+
+def _losses_of(place: Place) -> Losses:
+    return Losses(f"(process {place[0]})" if place[1] > 1 else "")

@@ -12,6 +12,7 @@ fewer repeat their first. Lengths in cells.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
@@ -113,6 +114,76 @@ def find_contacts(stack: Stack, tolerance: float) -> list[Contact]:
     return _on_ground(bodies, tolerance) + _between(bodies, tolerance)
 
 
+@dataclass(frozen=True)
+class PlaneContacts:
+    """Contacts of blocks that all stand in the plane of a design, seen from the front: c segments.
+
+    Args:
+        block, by: (c,) who is pushed, and who owns the face, or GROUND.
+        normal: (c, 2) unit vector out of the face, x and z.
+        ends: (c, 2, 2) both ends of the segment, x and z [cell]; the second lies further along (normal z, -normal x).
+        upright: (c,) whether the faces are nearly vertical.
+    """
+
+    block: Ints
+    by: Ints
+    normal: Floats
+    ends: Floats
+    upright: NDArray[np.bool_]
+
+    def on_top(self) -> PlaneContacts:
+        """Without those between upright faces."""
+        flat = ~self.upright
+        return PlaneContacts(self.block[flat], self.by[flat], self.normal[flat], self.ends[flat], self.upright[flat])
+
+
+def find_plane_contacts(stack: Stack, tolerances: Sequence[float]) -> list[PlaneContacts]:
+    """All contacts of blocks that are near the plane y = 0 and turned about the y axis alone, for each tolerance.
+
+    Args:
+        stack: The blocks; depths and small departures from the plane do not matter.
+        tolerances: Faces up to this far apart touch, upright ones, too [cell].
+    """
+    bodies = _place(stack)
+    owner, face, other = _touching_faces(bodies, max(tolerances), max(tolerances))
+    normal = bodies.normals[owner, face][:, [0, 2]]
+    normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), _SAME)
+    along = np.stack([normal[:, 1], -normal[:, 0]], axis=1)[..., None]
+    corners = np.take_along_axis(bodies.vertices[owner], bodies.corners[owner, face][..., None], axis=1)[..., [0, 2]]
+    faces = (corners @ along)[..., 0]
+    vertices, edges = bodies.vertices[other], bodies.edges[other]
+    heights = ((vertices[..., [0, 2]] - corners[:, :1]) @ normal[..., None])[..., 0]
+    foot = (corners[:, 0] * normal).sum(axis=1, keepdims=True) * normal  # of the face's line
+    upright = np.abs(normal[:, 1]) < FLAT
+    found = []
+    for tolerance in tolerances:
+        points, near = _slice(bodies.vertices, bodies.edges, bodies.vertices[..., 2], tolerance)
+        low, high = _extent(points[..., 0], near)
+        floor = np.flatnonzero(low <= high)
+        points, near = _slice(vertices, edges, heights, tolerance)
+        first, last = _extent((points[..., [0, 2]] @ along)[..., 0], near)
+        reach = np.stack([np.maximum(first, faces.min(axis=1)), np.minimum(last, faces.max(axis=1))], axis=1)
+        touch = np.flatnonzero(reach[:, 0] <= reach[:, 1])
+        ends = foot[touch, None] + reach[touch][..., None] * along[touch].transpose(0, 2, 1)
+        ground = np.stack([np.stack([low, high], axis=1)[floor], np.zeros((len(floor), 2))], axis=2)
+        found.append(
+            PlaneContacts(
+                np.concatenate([floor, other[touch]]),
+                np.concatenate([np.full(len(floor), GROUND), owner[touch]]),
+                np.concatenate([np.tile([0.0, 1.0], (len(floor), 1)), normal[touch]]),
+                np.concatenate([ground, ends]),
+                np.concatenate([np.zeros(len(floor), dtype=bool), upright[touch]]),
+            )
+        )
+    return found
+
+
+def _extent(coordinates: Floats, of: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """Least and largest coordinate (P,) of some of the points (P, V); inf and -inf of none."""
+    low = np.where(of, coordinates, np.inf).min(axis=1, initial=np.inf)
+    return low, np.where(of, coordinates, -np.inf).max(axis=1, initial=-np.inf)
+
+
 def _on_ground(bodies: _Bodies, tolerance: float) -> list[Contact]:
     blocks = np.flatnonzero(bodies.vertices[..., 2].min(axis=1, initial=np.inf) <= tolerance)
     points, near = _slice(bodies.vertices[blocks], bodies.edges[blocks], bodies.vertices[blocks][..., 2], tolerance)
@@ -128,7 +199,7 @@ def _on_ground(bodies: _Bodies, tolerance: float) -> list[Contact]:
 
 
 def _between(bodies: _Bodies, tolerance: float) -> list[Contact]:
-    owner, face, other = _touching_faces(bodies, tolerance)
+    owner, face, other = _touching_faces(bodies, tolerance, min(tolerance, SIDE))
     normals = bodies.normals[owner, face]  # (P, 3)
     corners = np.take_along_axis(bodies.vertices[owner], bodies.corners[owner, face][..., None], axis=1)  # (P, C, 3)
     origin = corners[:, 0]
@@ -149,7 +220,7 @@ def _between(bodies: _Bodies, tolerance: float) -> list[Contact]:
     return contacts
 
 
-def _touching_faces(bodies: _Bodies, tolerance: float) -> tuple[Ints, Ints, Ints]:
+def _touching_faces(bodies: _Bodies, tolerance: float, side: float) -> tuple[Ints, Ints, Ints]:
     """For each pair of blocks that no face separates by more than the tolerance: the block that owns the
     face which separates them best, the number of that face, and the other block; (P,) each."""
     low, high = bodies.vertices.min(axis=1), bodies.vertices.max(axis=1)
@@ -162,7 +233,7 @@ def _touching_faces(bodies: _Bodies, tolerance: float) -> tuple[Ints, Ints, Ints
     face = (apart + _LEDGE * upright).argmax(axis=2)  # (2, P)
     gap = np.take_along_axis(apart, face[..., None], axis=2)[..., 0]
     beside = np.take_along_axis(upright, face[..., None], axis=2)[..., 0]
-    touch = np.flatnonzero((gap <= np.where(beside, min(tolerance, SIDE), tolerance)).all(axis=0))
+    touch = np.flatnonzero((gap <= np.where(beside, side, tolerance)).all(axis=0))
     # Where both have such a face, as parallel ones are, rounding must not choose: the lower block has it.
     height = low[:, 2] + high[:, 2]
     first = gap[0] + np.where(height[one] < height[two], 1e-3, -1e-3) >= gap[1]

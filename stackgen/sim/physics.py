@@ -6,8 +6,12 @@ A verdict means nothing without them: they travel in every dataset manifest, wei
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+_OF_THE_WORLD = ("cell_size", "friction", "density", "gravity", "fall_height")
 
 
 @dataclass(frozen=True)
@@ -45,6 +49,24 @@ class Physics:
     rest_window: float = 0.0625
     rest_motion: float = 5e-4
     fall_height: float = 0.5
+
+    @staticmethod
+    def of_world(made: Mapping[str, Any] | None, given: Physics | None = None) -> Physics:
+        """The physics of the world that something was made in, simulated as this version does.
+
+        What blocks are and what counts as a fall belong to a world; step, solver and watch to the simulator.
+
+        Args:
+            made: A manifest's, card's or stacks file's physics, in plain form; None for the project's own.
+            given: Its settings that are not the defaults win.
+
+        >>> physics = Physics.of_world({"friction": 0.3, "fall_height": 0.25, "watch": 9.0}, Physics(friction=0.4))
+        >>> physics.friction, physics.fall_height, physics.watch
+        (0.4, 0.25, 2.0)
+        """
+        own = {name: made[name] for name in _OF_THE_WORLD if name in made} if made else {}
+        changed = {k: v for k, v in asdict(given or Physics()).items() if v != getattr(Physics(), k)}
+        return Physics(**{**own, **changed})
 
     def to_json(self) -> dict:
         """Plain form with the engine's name and version, for manifests and reports."""

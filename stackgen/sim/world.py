@@ -148,7 +148,12 @@ class _World:
         window = max(1, round(physics.rest_window / physics.time_step))
         look = max(1, window // 5)
         frames = [self.start] if record_every else []
-        anchor, anchor_step = self._states(), 0
+        start = anchor = self._states()
+        anchor_step = 0
+        # Until a coordinate of a centre of mass or of a quaternion changed by this much, no block can have moved
+        # far enough: turning by an angle changes the quaternion's length by at least a quarter of it.
+        arm = np.linalg.norm(self.com, axis=1).max(initial=0)
+        stir = min(until_moved, physics.fall_height if until_fall else np.inf) / (1 + 10 * arm)
         for step in range(1, max(1, round(physics.watch / physics.time_step)) + 1):
             bullet.stepSimulation(physicsClientId=self.client)
             if record_every and step % record_every == 0:
@@ -156,7 +161,7 @@ class _World:
             if step % look:
                 continue
             state = self._states()
-            if until_fall or until_moved < np.inf:
+            if np.abs(state - start).max(initial=0) > stir:
                 poses = self._poses(state)
                 moved = np.abs(poses[:, :3] - self.start[:, :3]).max(initial=0)
                 sank = (self.start[:, 2] - poses[:, 2]).max(initial=0)

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from stackgen.data.arrays import StackArrays, load_dataset, load_npz, save_npz
-from stackgen.data.shards import Sample
+from stackgen.data.arrays import Buffers, StackArrays, load_dataset, load_npz, save_npz
+from stackgen.data.decoding import Frame, decode_shard
+from stackgen.data.shards import Sample, encode_shard, read_shard
 from stackgen.geometry import mirror, silhouette
 from stackgen.stack import Stack, StackgenError
 
 FIELDS = ("shapes", "poses", "silhouettes", "template")
+BEYOND = np.array([1, 4], np.uint8)  # the second is no shape of the paper's catalogue
 
 
 def equal(a: StackArrays, b: StackArrays) -> bool:
@@ -70,6 +72,88 @@ def test_a_mirrored_sample_is_the_mirrored_stack_and_its_silhouette(splits: dict
         assert np.array_equal(got.shapes, expected.shapes) and np.array_equal(got.poses, expected.poses)
         image = silhouette(stack)
         assert np.array_equal(batch["silhouette"][i].numpy() > 0, image[:, ::-1] if flags[i] else image)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_batch_on_the_accelerator_is_the_one_on_the_cpu(splits: dict[str, StackArrays]) -> None:
+    arrays, everyone = splits["train"], torch.arange(71)
+    here = arrays.tensors.batch(everyone, everyone % 3 == 0, 8)
+    there = arrays.tensors.to("cuda").batch(everyone, everyone % 3 == 0, 8)
+    assert all(there[name].is_cuda and torch.equal(here[name], there[name].cpu()) for name in here)
+
+
+def test_a_batch_that_is_held_is_not_written_over(splits: dict[str, StackArrays]) -> None:
+    """Memory of pictures is used again, but only that of batches that nobody holds."""
+    arrays = splits["train"]
+    rng = np.random.default_rng(0)
+    chosen = [rng.integers(len(arrays), size=size) for size in rng.integers(1, 60, size=30)]
+    held = [arrays.batch(indices)["silhouette"][1:] for indices in chosen]  # a view holds on to it too
+    for indices, images in zip(chosen, held, strict=True):
+        assert np.array_equal(images.numpy() > 0, arrays.images(indices)[1:])
+
+
+def test_memory_is_used_again_once_it_is_free() -> None:
+    buffers = Buffers(most=2)
+    first = buffers.take(100)
+    place = first.data_ptr()
+    second = buffers.take(100)
+    assert second.data_ptr() != place
+    del first
+    third = buffers.take(40)
+    assert third.data_ptr() == place and len(third) == 40
+    del second, third
+    assert len(buffers.take(200)) == 200  # those that are too small are let go
+
+
+def test_a_shard_decoded_at_once_is_the_same_as_sample_by_sample(
+    samples: dict[str, list[Sample]], splits: dict[str, StackArrays], dataset: Path
+) -> None:
+    decoded = decode_shard((dataset / "validation-000002.tar").read_bytes(), Frame(10, 4, 64))
+    assert not decoded.broken and decoded.positions.tolist() == list(range(23))
+    whole = StackArrays.of(decoded, Frame(10, 4, 64))
+    assert equal(whole, StackArrays.from_samples(read_shard(dataset / "validation-000002.tar")))
+    assert equal(whole, splits["validation"])
+
+
+def test_whatever_bytes_a_shard_holds_samples_come_out_or_faults(samples: dict[str, list[Sample]]) -> None:
+    content = encode_shard(samples["train-000000.tar"][:3])
+    frame, rng = Frame(10, 4, 64), np.random.default_rng(0)
+    used = len(content.rstrip(b"\0"))
+    for _ in range(300):
+        broken = bytearray(content)
+        for place in rng.integers(0, used, rng.integers(1, 4)):
+            broken[place] = rng.integers(256)
+        for cut in (used, int(rng.integers(used))):
+            decoded = decode_shard(bytes(broken[:cut]), frame)
+            assert np.isfinite(decoded.poses).all() and len(decoded.positions) == len(decoded.shapes)
+            StackArrays.of(decoded, frame)  # it refuses what does not fit
+
+
+@pytest.mark.parametrize(
+    ("sample", "fault"),
+    [
+        (Sample("k", np.zeros(11, np.uint8), np.zeros((11, 6), np.float32), np.zeros((64, 64), bool), {"template": 0}),
+         "k: shapes of size (11,), not of 1 to 10 blocks"),
+        (Sample("k", np.zeros(2, np.uint8), np.zeros((3, 6), np.float32), np.zeros((64, 64), bool), {"template": 0}),
+         "k: poses of size (3, 6) for 2 blocks"),
+        (Sample("k", np.zeros(2, np.uint8), np.zeros((2, 6), np.float32), np.zeros((8, 8), bool), {"template": 0}),
+         "k: a packed silhouette of size (8, 1), not of 64 pixels square"),
+        (Sample("k", np.zeros(2, np.uint8), np.zeros((2, 6), np.float32), np.zeros((64, 64), bool), {}),
+         "k: no template"),
+        (Sample("k", np.zeros(2, np.uint8), np.zeros((2, 6), np.float32), np.zeros((64, 64), bool), {"template": "x"}),
+         "k: template 'x'"),
+        (Sample("k", BEYOND, np.zeros((2, 6), np.float32), np.zeros((64, 64), bool), {"template": 0}),
+         "k: poses that are not finite, or shapes beyond the catalogue"),
+    ],
+)  # fmt: skip
+def test_a_broken_sample_is_named_and_costs_no_other(
+    sample: Sample, fault: str, samples: dict[str, list[Sample]]
+) -> None:
+    good = samples["train-000000.tar"][:2]
+    decoded = decode_shard(encode_shard([good[0], sample, good[1]]), Frame(10, 4, 64))
+    assert decoded.broken == (fault,)
+    assert decoded.positions.tolist() == [0, 2]
+    assert decoded.template.tolist() == [s.meta["template"] for s in good]
 
 
 def test_the_compact_file_is_read_back_as_written(

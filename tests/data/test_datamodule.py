@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
+import json
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -10,60 +15,25 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from stackgen._lightning import pl
 from stackgen.data.arrays import StackArrays, save_npz
-from stackgen.data.datamodule import CachedLoader, StackDataModule, exact_batches, training_batches
+from stackgen.data.cached import CachedLoader
+from stackgen.data.datamodule import StackDataModule
+from stackgen.data.decoding import Frame
+from stackgen.data.physics import physics_differences, warn_of_other_physics
+from stackgen.data.shards import Manifest
 from stackgen.stack import StackgenError
+from tests.conftest import Cli
 
 
-def _place(rank: int) -> tuple[int, int]:
-    return rank, 3
+def _place(rank: int, world: int = 3) -> tuple[int, int]:
+    return rank, world
 
 
 def visited(loader: Any) -> list[int]:
     """Templates (here a sample's number) in the order of an epoch."""
     return [t for batch in loader for t in batch["template"].tolist()]
-
-
-@given(
-    sizes=st.lists(st.integers(1, 60), min_size=1, max_size=4),
-    batch_size=st.integers(1, 16),
-    world=st.integers(1, 4),
-    seed=st.integers(0, 99),
-)
-@settings(max_examples=100, deadline=None)
-def test_processes_share_a_training_pass_without_overlap(
-    sizes: list[int], batch_size: int, world: int, seed: int
-) -> None:
-    ends = np.cumsum([0, *sizes])
-    buckets = [np.arange(a, b) for a, b in itertools.pairwise(ends)]
-    ranks = [training_batches(buckets, batch_size, np.random.default_rng(seed), (rank, world)) for rank in range(world)]
-    assert len({len(batches) for batches in ranks}) == 1
-    everyone = np.concatenate([batch for batches in ranks for batch in batches] or [np.arange(0)])
-    assert len(set(everyone.tolist())) == len(everyone)
-    for bucket in buckets:  # only the rest of a last batch is left out
-        left_out = len(bucket) - np.isin(bucket, everyone).sum()
-        assert left_out < (batch_size if len(bucket) >= batch_size * world else 1) * world
-    for together in zip(*ranks, strict=True):
-        of = {int(np.searchsorted(ends, i, side="right")) for batch in together for i in batch}
-        assert len(of) == 1  # all processes in the same bucket at the same time
-        assert len({len(batch) for batch in together}) == 1
-
-
-@given(count=st.integers(1, 200), batch_size=st.integers(1, 32), world=st.integers(1, 8))
-@settings(max_examples=200, deadline=None)
-def test_an_exact_pass_visits_everyone_once_in_equally_many_batches(count: int, batch_size: int, world: int) -> None:
-    if count < world:
-        with pytest.raises(StackgenError):
-            exact_batches(count, batch_size, (0, world))
-        return
-    ranks = [exact_batches(count, batch_size, (rank, world)) for rank in range(world)]
-    assert len({len(batches) for batches in ranks}) == 1
-    assert all(1 <= len(batch) <= max(batch_size, 2 if world > 1 else 1) for batches in ranks for batch in batches)
-    assert sorted(int(i) for batches in ranks for batch in batches for i in batch) == list(range(count))
 
 
 def test_a_training_epoch_visits_every_sample_once_up_to_a_last_partial_batch(splits: dict[str, StackArrays]) -> None:
@@ -155,7 +125,9 @@ def test_validation_and_test_visit_every_sample_once_in_order(
     ("options", "message"),
     [
         ({"batch_size": 0}, "at least 1"),
-        ({"num_workers": 2}, "mode stream"),
+        ({"mode": "cached", "num_workers": 2}, "mode stream"),
+        ({"num_workers": -1}, "must not be negative"),
+        ({"mode": "stream", "path": "nowhere.npz"}, "needs a dataset of shards; nowhere.npz is no such folder"),
         ({"path": "nowhere"}, "no dataset at nowhere"),
     ],
 )
@@ -184,25 +156,255 @@ class _Recorder(pl.LightningModule):
         return torch.optim.SGD(self.parameters(), lr=0.1)
 
 
-def _fit(module: _Recorder, dataset: Path, folder: Path, steps: int, resume: Path | None = None) -> None:
+def _fit(
+    module: pl.LightningModule, data: StackDataModule, folder: Path, resume: Path | None = None, **options: Any
+) -> pl.Trainer:
     trainer = pl.Trainer(
-        default_root_dir=folder, max_steps=steps, accelerator="cpu", logger=False, enable_progress_bar=False,
-        enable_model_summary=False,
-        callbacks=[pl.callbacks.ModelCheckpoint(folder, every_n_train_steps=1, save_last=True)],
+        default_root_dir=folder, accelerator="cpu", logger=False, enable_progress_bar=False, enable_model_summary=False,
+        callbacks=[pl.callbacks.ModelCheckpoint(folder, every_n_train_steps=1, save_last=True)], **options,
     )  # fmt: skip
-    data = StackDataModule(dataset, batch_size=8, bucket_by_blocks=True, mirror=True)
     trainer.fit(module, data, ckpt_path=resume)
+    return trainer
 
 
 @pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("options", [{}, {"mode": "stream"}, {"samples_per_epoch": 40}], ids=str)
+@pytest.mark.parametrize("beyond", [0, 3])
 def test_a_fit_resumed_in_the_middle_of_an_epoch_sees_the_batches_it_would_have_seen(
-    dataset: Path, tmp_path: Path
+    dataset: Path, tmp_path: Path, options: dict[str, Any], beyond: int
 ) -> None:
+    def data() -> StackDataModule:
+        return StackDataModule(dataset, batch_size=8, bucket_by_blocks=True, mirror=True, **options)
+
     whole, first, second = _Recorder(), _Recorder(), _Recorder()
-    _fit(whole, dataset, tmp_path / "a", 20)
-    length = len(StackDataModule(dataset, batch_size=8, bucket_by_blocks=True).train_dataloader())  # type: ignore[arg-type]
-    stop = length + 3
-    _fit(first, dataset, tmp_path / "b", stop)
-    _fit(second, dataset, tmp_path / "b", 20, tmp_path / "b" / "last.ckpt")
+    _fit(whole, data(), tmp_path / "a", max_steps=20)
+    stop = len(data().train_dataloader()) + beyond
+    _fit(first, data(), tmp_path / "b", max_steps=stop)
+    _fit(second, data(), tmp_path / "b", tmp_path / "b" / "last.ckpt", max_steps=20)
     assert first.seen == whole.seen[:stop]
     assert second.seen == whole.seen[stop:]
+
+
+class _Validated(_Recorder):
+    """Counts validations too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.validated: list[int] = []
+
+    def validation_step(self, batch: dict[str, torch.Tensor], batch_idx: int) -> None:
+        self.validated += batch["template"].tolist()
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(("before", "after", "batches"), [(8, 16, 4), (16, 8, 8)])
+def test_a_fit_resumed_with_another_batch_size_finishes_the_epoch_exactly(
+    dataset: Path, tmp_path: Path, before: int, after: int, batches: int
+) -> None:
+    """71 samples. The same goes on with another number of processes, which Lightning cannot change in a test."""
+    first, second = _Validated(), _Validated()
+    _fit(first, StackDataModule(dataset, batch_size=before), tmp_path, max_steps=2)
+    _fit(second, StackDataModule(dataset, batch_size=after), tmp_path, tmp_path / "last.ckpt", max_epochs=3)
+    rest = (71 - 2 * before) // after
+    epoch = [t for batch in (*first.seen, *second.seen[:rest]) for t in batch]
+    assert len(epoch) == len(set(epoch)) == 2 * before + rest * after  # nobody twice, all that fill a batch
+    assert [len(batch) for batch in second.seen] == [after] * (rest + 2 * batches)
+    for number in range(2):  # the next epochs are whole ones
+        start = rest + number * batches
+        seen = [t for batch in second.seen[start : start + batches] for t in batch]
+        assert len(set(seen)) == batches * after
+    assert len(second.validated) >= 3 * 23
+
+
+# Resumed under another layout, without a trainer.
+
+
+@pytest.mark.parametrize("bucketed", [False, True])
+@pytest.mark.parametrize(("worlds"), [(2, 1), (1, 3), (3, 2, 1), (2, 2)])
+def test_an_epoch_in_memory_is_finished_exactly_on_any_number_of_processes(
+    splits: dict[str, StackArrays], worlds: tuple[int, ...], bucketed: bool
+) -> None:
+    state, seen = None, Counter[int]()
+    for turn, world in enumerate(worlds):
+        loaders = [
+            CachedLoader(
+                splits["train"],
+                4,
+                train=True,
+                bucket_by_blocks=bucketed,
+                epoch=lambda: 5,
+                place=partial(_place, rank, world),
+            )
+            for rank in range(world)
+        ]
+        if state is not None:
+            for loader in loaders:
+                loader.load_state_dict(state)
+        assert len({len(loader) for loader in loaders}) == 1
+        last = turn == len(worlds) - 1
+        lengths = set()
+        for loader in loaders:
+            shown = 0
+            for batch in loader:
+                seen.update(batch["template"].tolist())
+                shown += 1
+                if not last and shown == 2:
+                    break
+            lengths.add(shown)
+        assert len(lengths) == 1
+        state = loaders[0].state_dict()
+    assert max(seen.values()) == 1
+    together = 4 * worlds[-1]
+    assert 71 - len(seen) < (together if not bucketed else 7 * together)
+
+
+def test_an_epoch_that_was_finished_is_not_begun_again(splits: dict[str, StackArrays]) -> None:
+    one, two = (CachedLoader(splits["train"], 16, train=True) for _ in range(2))
+    visited(one)
+    two.load_state_dict(one.state_dict())
+    assert visited(two) == []
+    assert visited(two) == visited(one)
+
+
+# What is held in memory.
+
+
+def test_what_fits_is_cached_and_what_does_not_is_streamed(dataset: Path) -> None:
+    frame = Frame.of(Manifest.load(dataset))
+    assert frame.bytes_per_sample == 10 * 25 + 512 + 8 * 6
+    needed = {"train": (71 + 23) * frame.bytes_per_sample / 1e9, "validation": 23 * frame.bytes_per_sample / 1e9}
+
+    def choice(limit: float, mode: str = "auto") -> list[bool]:
+        data = StackDataModule(dataset, mode=mode, cache_gb=limit, test_path=dataset)  # type: ignore[arg-type]
+        data.setup("fit")
+        kinds = [type(loader).__name__ for loader in (data.train_dataloader(), data.val_dataloader())]
+        assert kinds == [
+            "CachedLoader" if data.is_cached("train") else "TrainingStream",
+            "CachedLoader" if data.is_cached("validation") else "ExactStream",
+        ]
+        return [data.is_cached("train"), data.is_cached("validation")]
+
+    assert choice(2.0) == choice(needed["train"]) == choice(0, "cached") == [True, True]
+    assert choice(needed["train"] * 0.99) == choice(needed["validation"]) == [False, True]
+    assert choice(needed["validation"] * 0.99) == choice(9.0, "stream") == [False, False]
+
+
+def test_a_stream_knows_the_scale_of_the_poses(dataset: Path, splits: dict[str, StackArrays]) -> None:
+    streamed = StackDataModule(dataset, mode="stream", mirror=True).pose_statistics()
+    assert all(map(np.array_equal, streamed, splits["train"].pose_statistics(mirror=True)))  # it has two shards only
+
+
+def test_memory_counted_is_memory_taken(splits: dict[str, StackArrays]) -> None:
+    arrays = splits["train"]
+    parts = (arrays.shapes, arrays.poses, arrays.silhouettes, arrays.template, arrays.counts, arrays.lengths)
+    assert sum(part.nbytes for part in parts) == len(arrays) * Frame(10, 4, 64).bytes_per_sample
+
+
+# Whose physics.
+
+
+def test_other_physics_are_named_once(recwarn: pytest.WarningsRecorder) -> None:
+    here = {"engine": "pybullet 3.2.7", "friction": 0.5, "watch": 2.0}
+    made = {**here, "friction": 0.25, "engine": "pybullet 3.2.6"}
+    for _ in range(2):
+        warn_of_other_physics("dataset x", made, here)
+    lines = [str(warning.message) for warning in recwarn]
+    assert lines == [
+        "dataset x was made with other physics than are used here: "
+        "engine pybullet 3.2.6 instead of pybullet 3.2.7, friction 0.25 instead of 0.5"
+    ]
+    for same in (here, None, {"engine": "pybullet absent", "new": 1}):
+        warn_of_other_physics("dataset y", same, here)
+    assert len(recwarn) == 1
+    assert physics_differences({"engine": "other 1"}, here) == ["engine other 1 instead of pybullet 3.2.7"]
+
+
+TINY = """
+trainer: {max_steps: 1, logger: false, enable_checkpointing: false, enable_progress_bar: false,
+          enable_model_summary: false, limit_val_batches: 0}
+model:
+  class_path: stackgen.models.ddpm.DDPM
+  init_args: {denoiser: {width: 32, layers: 1, heads: 2, feedforward: 64}}
+"""
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning:lightning.*", "ignore::FutureWarning")
+def test_fit_says_so_once_if_the_data_are_of_other_physics(
+    cli: Cli, towers_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(towers_dataset, "data")
+    manifest = Manifest.load("data")
+    replace(manifest, physics={**manifest.physics, "solver_iterations": 20}).save(Path("data"))
+    Path("tiny.yaml").write_text(TINY)
+    with pytest.warns(UserWarning, match="other physics") as caught:
+        answer = cli("fit", "--config", "tiny.yaml", "--data.path", "data")
+    assert answer.code == 0, answer.err
+    lines = [str(warning.message) for warning in caught if "physics" in str(warning.message)]
+    assert lines == ["dataset data was made with other physics than are used here: solver_iterations 20 instead of 60"]
+
+
+DISTRIBUTED = """
+import json, sys
+import torch
+from stackgen._lightning import pl
+from stackgen.data.datamodule import StackDataModule
+
+class Model(pl.LightningModule):
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1))
+        self.seen = {"train": [], "validation": [], "test": []}
+    def step(self, name, batch):
+        self.seen[name].append(batch["template"].tolist())
+        self.log(name, float(len(batch["template"])), sync_dist=True, on_step=name == "train", on_epoch=True)
+        return self.weight.sum() * 0
+    def training_step(self, batch, _): return self.step("train", batch)
+    def validation_step(self, batch, _): self.step("validation", batch)
+    def test_step(self, batch, _): self.step("test", batch)
+    def configure_optimizers(self): return torch.optim.SGD(self.parameters(), lr=0.1)
+
+folder, mode, workers, out = sys.argv[1:]
+data = StackDataModule(folder, 8, mode=mode, num_workers=int(workers), test_path=folder, eval_batch_size=3)
+trainer = pl.Trainer(
+    accelerator="cpu", devices=2, strategy="ddp_fork", max_epochs=2, logger=False, enable_checkpointing=False,
+    enable_progress_bar=False, enable_model_summary=False, num_sanity_val_steps=0,
+)
+class Keep(pl.Callback):
+    def on_fit_end(self, trainer, module):
+        with open(f"{out}/{trainer.global_rank}.json", "w") as file:
+            json.dump(module.seen, file)
+trainer.callbacks.append(Keep())
+trainer.fit(Model(), data)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("mode", "workers"), [("cached", 0), ("stream", 0), ("stream", 1)])
+@pytest.mark.parametrize("damaged", [False, True])
+def test_two_processes_of_lightning_see_everyone_once_and_none_waits(
+    dataset: Path, tmp_path: Path, mode: str, workers: int, damaged: bool
+) -> None:
+    folder = tmp_path / "data"
+    shutil.copytree(dataset, folder)
+    if damaged:
+        if mode == "cached":
+            pytest.skip("memory refuses it before training begins")
+        (folder / "train-000001.tar").write_bytes(b"")
+    command = [sys.executable, "-c", DISTRIBUTED, str(folder), mode, str(workers), str(tmp_path)]
+    done = subprocess.run(
+        command, capture_output=True, text=True, timeout=120, check=False, cwd=Path(__file__).parents[2]
+    )
+    assert done.returncode == 0, done.stderr
+    ranks = [json.loads((tmp_path / f"{rank}.json").read_text()) for rank in range(2)]
+    for name in ("train", "validation"):
+        assert len(ranks[0][name]) == len(ranks[1][name]) > 0
+        half = len(ranks[0][name]) // 2
+        for epoch in (slice(half), slice(half, None)):
+            seen = [t for rank in ranks for batch in rank[name][epoch] for t in batch]
+            if name == "validation":
+                assert sorted(seen) == list(range(71, 94))
+            elif not damaged:
+                assert len(seen) == len(set(seen)) == 64
+            else:
+                assert len(seen) == 64 and set(seen) <= set(range(41)) and "train-000001.tar" in done.stderr

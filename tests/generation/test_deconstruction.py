@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,9 @@ import pytest
 from stackgen.data.generation.deconstruction import Judge, deconstruct, surely_falls
 from stackgen.data.generation.templates import Template, draw_template, realize
 from stackgen.geometry import block_vertices, tilt
+from stackgen.sim.certificate import Certificate
 from stackgen.sim.verdict import AcceptLimits, accept, fell
-from stackgen.sim.world import Simulator
+from stackgen.sim.world import Rollout, Simulator
 from stackgen.stack import Stack
 
 Family = list[tuple[tuple[int, ...], Stack]]
@@ -44,6 +46,11 @@ def families(simulator: Simulator) -> list[tuple[Stack, Family]]:
 def without(stack: Stack, *blocks: int) -> Stack:
     keep = [b for b in range(len(stack)) if b not in blocks]
     return Stack(stack.shapes[keep], stack.poses[keep])
+
+
+def upright(*blocks: tuple[int, float, float]) -> Stack:
+    """Blocks as (shape, x, z)."""
+    return Stack(np.array([b[0] for b in blocks]), np.array([[x, 0, z, 0, 0, 0] for _, x, z in blocks]))
 
 
 def of(key: str) -> Stack:
@@ -139,12 +146,94 @@ def test_settling_twice_is_stricter_and_settling_is_what_it_says(simulator: Simu
     rollout = simulator.rollout(stack)
     settled, again = once.settle(stack), twice.settle(stack)
     assert settled is not None and again is not None
-    assert (settled.poses == rollout.end.poses).all()
-    assert (again.poses == simulator.rollout(rollout.end).end.poses).all()
+    assert (settled.stack.poses == rollout.end.poses).all()
+    assert (again.stack.poses == simulator.rollout(rollout.end).end.poses).all()
     assert Judge(simulator, AcceptLimits(displacement=1e-9), False).settle(stack) is None
 
 
-# The short cut past the simulator.
+# The short cuts past the simulator.
+
+
+class Counting:
+    """A simulator that counts what it is asked."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.simulator = simulator
+        self.physics = simulator.physics
+        self.rollouts = 0
+
+    def rollout(self, stack: Stack, **options: float) -> Rollout:
+        self.rollouts += 1
+        return self.simulator.rollout(stack, **options)  # type: ignore[arg-type]
+
+
+def certified(simulator: Simulator | Counting, **margins: float) -> Judge:
+    return Judge(simulator, LIMITS, settle_twice=True, certificate=replace(Certificate(), **margins))  # type: ignore[arg-type]
+
+
+def test_with_the_certificate_the_family_is_the_same_but_for_what_has_no_margin(
+    families: list[tuple[Stack, Family]], simulator: Simulator
+) -> None:
+    counting = Counting(simulator)
+    judge = certified(counting, sure_designs=False)
+    both = only_simulated = only_certified = 0
+    for template, family in families:
+        ways, simulated = {way for way, _ in deconstruct(template, judge)}, {way for way, _ in family}
+        both += len(ways & simulated)
+        only_simulated += len(simulated - ways)
+        only_certified += len(ways - simulated)
+    assert both > 20 and only_certified <= 0.02 * both and only_simulated <= 0.1 * both
+    assert counting.rollouts < 0.5 * both  # one at least for each of the four templates
+
+
+def test_what_is_certain_to_stand_stays_where_it_was(
+    families: list[tuple[Stack, Family]], simulator: Simulator
+) -> None:
+    counting = Counting(simulator)
+    settled = certified(counting).settle(families[0][0])
+    assert settled is not None and settled.outcome == "stands" and counting.rollouts == 1
+    for place in range(len(settled.stack)):
+        rest = settled.less(place)
+        kept = np.delete(np.arange(len(settled.stack)), place)
+        assert (rest.part == kept).all() and (rest.stack.poses == settled.stack.poses[kept]).all()
+        if rest.outcome != "unsure":
+            before = counting.rollouts
+            assert certified(counting).settle_rest(rest) is (rest if rest.outcome == "stands" else None)
+            assert counting.rollouts == before
+
+
+def test_a_family_does_not_depend_on_what_was_judged_before(
+    families: list[tuple[Stack, Family]], simulator: Simulator
+) -> None:
+    judge = certified(simulator, inset=0.05)  # more that is unsure
+    (first, _), (second, _) = families[:2]
+
+    def content(template: Stack) -> list[tuple[tuple[int, ...], bytes]]:
+        return [(way, stack.poses.tobytes()) for way, stack in deconstruct(template, judge, 2)]
+
+    alone = content(second)
+    content(first)
+    assert content(second) == alone and len(alone) > 3
+
+
+def test_only_sure_designs_are_built_unless_one_says_otherwise(simulator: Simulator) -> None:
+    """The rectangle's centre of mass is 0.01 cells inside the edge of the cube that bears it."""
+    design = upright((0, 0, 0.5), (1, 0.49, 1.5))
+    counting = Counting(simulator)
+    assert certified(counting).settle(design) is None and counting.rollouts == 0
+    certified(counting, sure_designs=False).settle(design)
+    assert counting.rollouts >= 1
+    fallen = upright((0, 0, 0.5), (1, 0.6, 1.5))
+    before = counting.rollouts
+    assert certified(counting, sure_designs=False).settle(fallen) is None and counting.rollouts == before
+
+
+def test_what_leans_is_no_data_even_if_it_stands(simulator: Simulator) -> None:
+    """A cube beside its support comes to lean on a pillar."""
+    leaning = upright((0, 0, 0.5), (0, 0.51, 1.5), (0, 1.53, 0.5), (0, 1.53, 1.5))
+    simulated, judge = Judge(simulator, LIMITS, settle_twice=True), certified(simulator, sure_designs=False)
+    assert simulated.settle(leaning) is not None
+    assert judge.settle(leaning) is None
 
 
 def test_what_surely_falls_is_never_what_the_simulator_accepts(

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import signal
-import subprocess
-import sys
-import time
+import json
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,35 +16,23 @@ import pytest
 from stackgen.data.generation import generate as module
 from stackgen.data.generation.generate import GenerateSettings, generate, template_samples, testset_layouts
 from stackgen.data.generation.templates import Template, TemplateSettings
+from stackgen.data.generation.workshop import Shard
 from stackgen.data.shards import SPLITS, Manifest, Sample, read_shard
 from stackgen.geometry import PAPER_GRID, Grid, silhouette
+from stackgen.sim.certificate import Certificate
 from stackgen.sim.physics import Physics
 from stackgen.sim.verdict import AcceptLimits
 from stackgen.sim.world import Simulator
 from stackgen.stack import PAPER_CATALOGUE, Catalogue, Shape, StackgenError
-from tests.conftest import CHILD
-
-SMALL = GenerateSettings("small", 45, seed=5, templates_per_shard=2, validation=0.2, test=0.2)
+from tests.conftest import Cli
+from tests.generation.making import SMALL, Here, Stored, contents, copy, flip
 
 testset_layouts.__test__ = False  # type: ignore[attr-defined]  # a function of the generator, not a test
-
-
-def contents(folder: Path) -> dict[str, str]:
-    """Checksum of every file."""
-    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def samples_of(folder: Path) -> list[Sample]:
     manifest = Manifest.load(folder)
     return [sample for split in SPLITS for sample in manifest.samples(folder, split)]
-
-
-@pytest.fixture(scope="module")
-def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset by one worker."""
-    folder = tmp_path_factory.mktemp("generate") / "small"
-    generate(SMALL, folder, workers=1)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -59,66 +44,39 @@ def simulator() -> Iterator[Simulator]:
 # The same bytes.
 
 
-def test_three_workers_make_what_one_makes(small: Path, tmp_path: Path) -> None:
-    stored: list[int] = []
-    manifest = generate(SMALL, tmp_path / "again", workers=3, progress=stored.append)
-    assert contents(tmp_path / "again") == contents(small)
-    assert stored == sorted(stored) and stored[-1] == 45 and len(stored) > 2
-    assert manifest == Manifest.load(small)
-
-
-def test_a_killed_run_goes_on_to_the_same_bytes(small: Path, tmp_path: Path) -> None:
-    out = tmp_path / "killed"
-    program = (
-        "from pathlib import Path; from tests.generation.test_generate import SMALL, generate\n"
-        f"if __name__ == '__main__': generate(SMALL, Path({str(out)!r}), workers=1)\n"
-    )
-    script = tmp_path / "run.py"
-    script.write_text(program)
-    process = subprocess.Popen([sys.executable, str(script)], env=CHILD, start_new_session=True)
-    while not list(out.glob("*.tar")):
-        assert process.poll() is None
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert not (out / "dataset.json").exists() and 1 <= len(list(out.glob("*.tar"))) < len(list(small.glob("*.tar")))
-    deadline = time.monotonic() + 20
-    while workers_of(process.pid):  # they end on their own when nobody is left to work for
-        assert time.monotonic() < deadline
-        time.sleep(0.1)
-    generate(SMALL, out, workers=2)
-    assert contents(out) == contents(small)
-
-
-def workers_of(session: int) -> list[str]:
-    """Worker processes that live in a session."""
-    answer = subprocess.run(["ps", "-s", str(session), "-o", "args="], capture_output=True, text=True)
-    return [line for line in answer.stdout.splitlines() if "spawn_main" in line]
-
-
-def test_what_is_lost_is_made_again_and_what_is_done_is_left_alone(small: Path, tmp_path: Path) -> None:
-    out = tmp_path / "copy"
-    out.mkdir()
-    for path in small.iterdir():
-        (out / path.name).write_bytes(path.read_bytes())
-    before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
-    generate(SMALL, out, workers=1)
-    assert {path.name: path.stat().st_mtime_ns for path in out.iterdir()} == before
+def test_what_is_lost_is_made_again(small: Path, shards: dict[int, Shard], tmp_path: Path) -> None:
+    out = copy(small, tmp_path / "copy")
     first, *_, last = sorted(out.glob("*.tar"), key=lambda path: path.name[-10:])
     first.unlink()
     last.unlink()
     (out / "dataset.json").unlink()
     (out / ".train-000001.tar.0123abcd.tmp").write_bytes(b"half")
-    generate(SMALL, out, workers=1)
+    generate(SMALL, out, executor=Stored(shards))
     assert contents(out) == contents(small)
 
 
-def test_a_draw_is_part_of_the_whole_and_drawing_again_changes_nothing(small: Path, tmp_path: Path) -> None:
+def test_the_settings_of_a_manifest_are_those_it_was_made_with(small: Path) -> None:
+    assert GenerateSettings.from_manifest(Manifest.load(small)) == SMALL
+    template = TemplateSettings(top_row_only=("triangle", "cube"))
+    other = replace(SMALL, physics=Physics(friction=0.4), template=template, accept=AcceptLimits(tilt=0.2))
+    manifest = Manifest(
+        other.name, other.seed, other.catalogue, other.grid, other.max_blocks, other.physics.to_json(), other.to_json()
+    )
+    assert GenerateSettings.from_manifest(manifest) == other
+    strange = replace(manifest, settings={**manifest.settings, "sturdy": True})
+    with pytest.raises(StackgenError, match=r"not made by this version .*sturdy"):
+        GenerateSettings.from_manifest(strange)
+
+
+def test_a_draw_is_part_of_the_whole_and_drawing_again_changes_nothing(
+    small: Path, shards: dict[int, Shard], tmp_path: Path
+) -> None:
     out = tmp_path / "drawn"
     settings = replace(SMALL, stacks=30, draw=15)
-    manifest = generate(settings, out, workers=1)
+    manifest = generate(settings, out, executor=Stored(shards))
     assert sum(manifest.count(split) for split in SPLITS) == 15 and len(manifest.shards) == 1
-    assert sorted(path.name for path in out.iterdir()) == ["dataset.json", "generate.json", manifest.shards[0]["file"]]
+    tar = manifest.shards[0]["file"]
+    assert sorted(path.name for path in out.iterdir()) == ["README.md", "dataset.json", "generate.json", tar]
     drawn = samples_of(out)
     whole = {sample.key: sample for sample in samples_of(small)}
     order = sorted(whole, key=lambda key: key[:8])  # stable: as the generator wrote them
@@ -126,10 +84,7 @@ def test_a_draw_is_part_of_the_whole_and_drawing_again_changes_nothing(small: Pa
     assert places == sorted(set(places))
     assert all((whole[sample.key].poses == sample.poses).all() for sample in drawn)
     before = contents(out)
-    generate(settings, out, workers=1)
-    assert contents(out) == before
-    (out / "dataset.json").unlink()  # as if cut off between the shard and the manifest
-    generate(settings, out, workers=1)
+    generate(settings, out, executor=Stored({}))
     assert contents(out) == before
 
 
@@ -226,11 +181,13 @@ def test_a_generator_that_meets_a_test_layout_leaves_it_out(
 ) -> None:
     """With its own first templates as the test set, a dataset begins after them."""
     frozen = tmp_path / "testset"
-    first = generate(replace(SMALL, stacks=8, draw=8, validation=0, test=1, exclude_testset=False), frozen, workers=1)
+    first = generate(
+        replace(SMALL, stacks=8, draw=8, validation=0, test=1, exclude_testset=False), frozen, executor=Here()
+    )
     forbidden = {sample.meta["layout"] for sample in first.samples(frozen, "test")}
     assert forbidden & {sample.meta["layout"] for sample in samples_of(small)}
     monkeypatch.setattr(module, "TESTSET", frozen)
-    generate(replace(SMALL, stacks=12), tmp_path / "rest", workers=1)
+    generate(replace(SMALL, stacks=12), tmp_path / "rest", executor=Here())
     found = {sample.meta["layout"] for sample in samples_of(tmp_path / "rest")}
     assert found and found.isdisjoint(forbidden)
 
@@ -260,25 +217,48 @@ def test_a_folder_of_other_settings_is_refused_and_left_alone(small: Path) -> No
         replace(SMALL, template=TemplateSettings(displacement=0.2)),
     ):
         with pytest.raises(StackgenError, match="other settings") as caught:
-            generate(other, small, workers=1)
+            generate(other, small, executor=Stored({}))
         assert "\n" not in str(caught.value)
     assert contents(small) == before
+
+
+def test_a_folder_of_the_same_settings_from_before_they_were_all_written_down_is_accepted(
+    shards: dict[int, Shard], tmp_path: Path
+) -> None:
+    plain = replace(SMALL, certificate=Certificate(enabled=False), settle_twice=False)
+    generate(plain, tmp_path, executor=Stored(shards))
+    claim = tmp_path / "generate.json"
+    before = json.loads(claim.read_text())
+    del before["settings"]["certificate"], before["settings"]["revision"]
+    claim.write_text(json.dumps(before))
+    generate(plain, tmp_path, executor=Stored({}))
+    for other in (SMALL, replace(plain, seed=7)):
+        with pytest.raises(StackgenError, match="other settings"):
+            generate(other, tmp_path, executor=Stored({}))
+    claim.write_text("{")
+    with pytest.raises(StackgenError, match="other settings"):
+        generate(plain, tmp_path, executor=Stored({}))
 
 
 def test_a_folder_of_unknown_shards_is_refused(small: Path, tmp_path: Path) -> None:
     (tmp_path / "train-000000.tar").write_bytes(next(small.glob("*.tar")).read_bytes())
     with pytest.raises(StackgenError, match=r"no generate\.json"):
-        generate(SMALL, tmp_path, workers=1)
+        generate(SMALL, tmp_path, executor=Stored({}))
     assert [path.name for path in tmp_path.iterdir()] == ["train-000000.tar"]
 
 
-def test_a_damaged_shard_is_named_and_not_built_upon(small: Path, tmp_path: Path) -> None:
-    for path in small.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    victim = next(tmp_path.glob("*-000001.tar"))
-    victim.write_bytes(victim.read_bytes()[: victim.stat().st_size // 2])
-    with pytest.raises(StackgenError, match=victim.name):
-        generate(SMALL, tmp_path, workers=1)
+def test_damage_since_the_dataset_was_complete_is_named_with_the_way_out(small: Path, tmp_path: Path) -> None:
+    out = copy(small, tmp_path / "copy")
+    victim, other = (out / entry["file"] for entry in Manifest.load(out).shards[:2])
+    flip(victim, 600)
+    before = contents(out)
+    line = rf"{victim.name}: missing or damaged .* `stackgen dataset repair {out}`"
+    with pytest.raises(StackgenError, match=line) as caught:
+        generate(SMALL, out, executor=Stored({}))
+    assert "\n" not in str(caught.value) and contents(out) == before
+    other.unlink()
+    with pytest.raises(StackgenError, match=f"{victim.name} and 1 more"):
+        generate(SMALL, out, executor=Stored({}))
 
 
 @pytest.mark.parametrize(
@@ -296,4 +276,36 @@ def test_settings_that_make_no_sense_are_refused(change: dict[str, float]) -> No
 def test_settings_that_no_stack_can_meet_end_with_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_HOPELESS", 2)
     with pytest.raises(StackgenError, match="gave no stack"):
-        generate(replace(SMALL, max_blocks=3, templates_per_shard=1), tmp_path / "none", workers=1)
+        generate(replace(SMALL, max_blocks=3, templates_per_shard=1), tmp_path / "none", executor=Here())
+
+
+# The command line.
+
+SMALL_OPTIONS = [
+    "--name", "small", "--stacks", 45, "--seed", 5, "--templates_per_shard", 2, "--validation", 0.2, "--test", 0.2,
+]  # fmt: skip
+
+
+def test_jobs_make_ranges_and_a_run_without_one_collects_them(
+    small: Path, shards: dict[int, Shard], tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stackgen.commands.generate.make_executor", lambda *_: Stored(shards))
+    out = ["--out", tmp_path / "small"]
+    answer = cli("generate", *SMALL_OPTIONS, *out, "--shard_range", "1:3")
+    assert answer.code == 0 and f"{shards[1].samples + shards[2].samples} stacks" in answer.out
+    assert sorted(p.name for p in (tmp_path / "small").glob("*.tar")) == sorted(shards[n].name for n in (1, 2))
+    assert cli("generate", *SMALL_OPTIONS, *out).code == 0
+    assert contents(tmp_path / "small") == contents(small)
+
+
+@pytest.mark.parametrize("text", ["3", "3:3", "5:2", "-1:2", "a:b", "1:2:3"])
+def test_a_range_that_makes_no_sense_is_one_line(text: str, tmp_path: Path, cli: Cli) -> None:
+    answer = cli("generate", *SMALL_OPTIONS, "--out", tmp_path / "x", f"--shard_range={text}")
+    assert answer.code == 2 and "should read A:B" in answer.line and not (tmp_path / "x").exists()
+
+
+def test_executors_and_workers_that_do_not_exist_are_one_line(tmp_path: Path, cli: Cli) -> None:
+    out = ["--out", tmp_path / "x"]
+    assert "ray" in cli("generate", *SMALL_OPTIONS, *out, "--executor", "cloud").line
+    assert "at least 1" in cli("generate", *SMALL_OPTIONS, *out, "--workers", 0).line
+    assert not (tmp_path / "x").exists()

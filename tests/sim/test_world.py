@@ -201,6 +201,25 @@ def test_until_moved_ends_as_soon_as_a_block_is_away(simulator: Simulator) -> No
     assert 0.2 < moved(rollout) < 0.5 and not rollout.at_rest
 
 
+@pytest.mark.parametrize("stack", [RUIN, TOWER], ids=["ruin", "tower"])
+@pytest.mark.parametrize("until", [{"until_fall": True}, {"until_moved": 0.2}, {"until_moved": 0.9}])
+def test_a_rollout_is_cut_off_where_the_whole_one_first_says_so(
+    simulator: Simulator, stack: Stack, until: dict[str, float]
+) -> None:
+    """It is looked at every sixth step; what is found then must not depend on how carefully one looks."""
+    whole = simulator.rollout(stack, record_every=6)
+    assert whole.trajectory is not None
+    away = np.abs(whole.trajectory[..., :3] - stack.poses[:, :3]).max(axis=(1, 2)) > until.get("until_moved", np.inf)
+    if "until_fall" in until:
+        away |= (stack.poses[:, 2] - whole.trajectory[..., 2]).max(axis=1) > simulator.physics.fall_height
+    cut = simulator.rollout(stack, **until)  # type: ignore[arg-type]
+    if away.any():
+        assert round(cut.time / simulator.physics.time_step) == 6 * int(away.argmax())
+        assert (cut.end.poses == whole.trajectory[away.argmax()]).all()
+    else:
+        assert (cut.end.poses == whole.end.poses).all() and cut.at_rest == whole.at_rest
+
+
 def test_nothing_is_a_stack_that_rests(simulator: Simulator) -> None:
     rollout = simulator.rollout(Stack(np.zeros(0, int), np.zeros((0, 6))))
     assert rollout.at_rest and len(rollout.drop) == 0

@@ -8,9 +8,41 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from stackgen.sim.certificate import Certificate, Outcome, PlaneStatics
 from stackgen.sim.verdict import AcceptLimits, accept
 from stackgen.sim.world import Simulator
 from stackgen.stack import Stack
+
+NEVER = Certificate(enabled=False)
+"""Statics is never asked."""
+
+
+@dataclass(frozen=True)
+class Settled:
+    """A stack at rest, and the simulated stack that it is a part of.
+
+    Args:
+        stack: The blocks that are left, at rest.
+        part: (k,) their numbers among the blocks of the stack that was simulated last on the way here.
+        statics: What is known of that stack's parts; None if statics is not asked.
+    """
+
+    stack: Stack
+    part: NDArray[np.int64]
+    statics: PlaneStatics | None
+
+    @property
+    def outcome(self) -> Outcome:
+        """What is known of it without simulating."""
+        if self.statics is not None:
+            return self.statics.outcome(self.part)
+        return "falls" if surely_falls(self.stack) else "unsure"
+
+    def less(self, place: int) -> Settled:
+        """What is left when one block is taken out; whether it stands is another question."""
+        keep = np.delete(np.arange(len(self.stack)), place)
+        stack = Stack(self.stack.shapes[keep], self.stack.poses[keep], self.stack.catalogue)
+        return Settled(stack, self.part[keep], self.statics)
 
 
 @dataclass(frozen=True)
@@ -20,31 +52,58 @@ class Judge:
     Args:
         simulator: Of the dataset's catalogue and physics.
         limits: See AcceptLimits.
-        settle_twice: Simulate the settled stack again, from a fresh start: it must stand once more.
-            The paper settles once; a marginal stack or two then slips in.
+        settle_twice: Simulate the settled stack again, from a fresh start: it must stand once more, unless
+            statics confirms that it does. The paper settles once; a marginal stack or two then slips in.
+        certificate: When statics may speak for the simulator; by default never.
     """
 
     simulator: Simulator
     limits: AcceptLimits
     settle_twice: bool
+    certificate: Certificate = NEVER
 
-    def settle(self, stack: Stack) -> Stack | None:
-        """The settled stack, or None."""
-        if surely_falls(stack):
-            return None
+    def settle(self, stack: Stack) -> Settled | None:
+        """A design at rest, or None. Whatever is known of it, it is put down first: designs are not at rest."""
+        outcome = self._known(stack).outcome
+        sure = outcome == "stands" or not (self.certificate.enabled and self.certificate.sure_designs)
+        return self._simulated(stack) if sure and outcome != "falls" else None
+
+    def settle_rest(self, rest: Settled) -> Settled | None:
+        """What is left of a settled stack, at rest; or None. What is certain to stand is at rest where it is."""
+        match rest.outcome:
+            case "stands":
+                return rest
+            case "falls":
+                return None
+            case "unsure":
+                return self._simulated(rest.stack)
+
+    def _simulated(self, stack: Stack) -> Settled | None:
         for _ in range(1 + self.settle_twice):
             rollout = self.simulator.rollout(stack, until_moved=self.limits.displacement)
             if not accept(rollout, self.limits):
                 return None
             stack = rollout.end
-        return stack
+            settled = self._known(stack)
+            if settled.statics is None or settled.statics.silent:
+                continue
+            if not settled.statics.holds(0.0):
+                return None
+            if settled.statics.holds(self.certificate.confirm):
+                break
+        return settled
+
+    def _known(self, stack: Stack) -> Settled:
+        friction, certificate = self.simulator.physics.friction, self.certificate
+        statics = PlaneStatics(stack, friction, certificate) if certificate.enabled else None
+        return Settled(stack, np.arange(len(stack)), statics)
 
 
 def deconstruct(template: Stack, judge: Judge, max_removals: int = 4) -> Iterator[tuple[tuple[int, ...], Stack]]:
     """The template and what is left of it after every way of taking blocks out, as long as it stands.
 
     Blocks are taken out one at a time, from settled and stable stacks only; what two orders of removal
-    both reach is simulated once. The top row keeps at least one block, so every stack keeps its height.
+    both reach is judged once. The top row keeps at least one block, so every stack keeps its height.
 
     Yields:
         The numbers of the removed blocks and the settled rest, fewest removals first.
@@ -54,21 +113,20 @@ def deconstruct(template: Stack, judge: Judge, max_removals: int = 4) -> Iterato
         return
     bottoms = np.round(template.poses[:, 2], 3)
     top = frozenset(np.flatnonzero(bottoms == bottoms.max()).tolist())
-    level: dict[tuple[int, ...], Stack] = {(): settled}
+    level: dict[tuple[int, ...], Settled] = {(): settled}
     for removals in range(max_removals + 1):
-        yield from level.items()
+        yield from ((removed, settled.stack) for removed, settled in level.items())
         if removals == max_removals:
             return
-        below: dict[tuple[int, ...], Stack | None] = {}
-        for removed, stack in level.items():
+        below: dict[tuple[int, ...], Settled | None] = {}
+        for removed, settled in level.items():
             left = [b for b in range(len(template)) if b not in removed]
             for place, block in enumerate(left):
                 taken = tuple(sorted((*removed, block)))
                 if taken in below or not top - set(taken):
                     continue
-                keep = [i for i in range(len(left)) if i != place]
-                below[taken] = judge.settle(Stack(stack.shapes[keep], stack.poses[keep], stack.catalogue))
-        level = {taken: stack for taken, stack in below.items() if stack is not None}
+                below[taken] = judge.settle_rest(settled.less(place))
+        level = {taken: settled for taken, settled in below.items() if settled is not None}
 
 
 def surely_falls(stack: Stack, reach: float = 0.1, slack: float = 0.05) -> bool:

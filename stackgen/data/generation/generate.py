@@ -2,40 +2,40 @@
 
 A shard holds all stacks of a fixed range of templates, and each template has its own random stream,
 so a shard's bytes depend on the settings and its number alone: not on the number of workers, nor on
-whether the run was interrupted. Shards appear under their final name only when complete; a run that
-is started again goes on with those that are missing.
+whether the run was interrupted. A run that is started again goes on with the shards that are missing.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
-import multiprocessing
-import os
-import shutil
-import signal
-import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from functools import cache, partial
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 
+from stackgen.data.card import write_card
 from stackgen.data.generation.deconstruction import Judge, deconstruct
+from stackgen.data.generation.executors import Executor, make_executor
+from stackgen.data.generation.pictures import Pictures
 from stackgen.data.generation.templates import Template, TemplateSettings, draw_template, realize
-from stackgen.data.shards import Manifest, Sample, Split, read_shard, write_shard
+from stackgen.data.generation.workshop import Entry, Shard, Workshop, claim, disk_may_be_full, finished, sweep
+from stackgen.data.shards import PARTS, Manifest, Sample, Split, encode_shard, read_shard, shard_entry, split_of
 from stackgen.files import write_atomically
-from stackgen.geometry import PAPER_GRID, Grid, silhouette
+from stackgen.geometry import PAPER_GRID, Grid
+from stackgen.sim.certificate import Certificate
 from stackgen.sim.physics import Physics
 from stackgen.sim.verdict import AcceptLimits
 from stackgen.sim.world import Simulator
 from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, StackgenError
 
 TESTSET = Path(__file__).resolve().parents[2] / "assets" / "testset-v1"
-_GOLDEN = 0.6180339887498949
+REVISION = 1
+"""Of the generator: raised when equal settings begin to mean other stacks, so that nobody mixes the two."""
 _HOPELESS = 2000  # templates without a stack, after which none is expected
 
 
@@ -52,10 +52,11 @@ class GenerateSettings:
         draw: Keep only so many of the stacks, drawn uniformly; 0 keeps all.
         max_removals: Blocks taken out of a template, at most.
         max_blocks: Stacks of more blocks are not stored, but still deconstructed.
-        settle_twice: A stack must stand again when simulated from its settled poses.
+        settle_twice: A stack must stand again when simulated from its settled poses, unless statics is certain.
         exclude_testset: Leave out every template that `testset-v1` uses, and its mirror image.
         template: How designs are drawn.
         accept: When a settled stack is good enough.
+        certificate: When statics is certain enough to spare the simulator a stack.
         physics: Of the simulator.
         grid: Design grid and silhouette scale.
         catalogue: The shapes.
@@ -70,10 +71,11 @@ class GenerateSettings:
     draw: int = 0
     max_removals: int = 4
     max_blocks: int = MAX_BLOCKS
-    settle_twice: bool = False
+    settle_twice: bool = True
     exclude_testset: bool = True
     template: TemplateSettings = field(default_factory=TemplateSettings)
     accept: AcceptLimits = field(default_factory=AcceptLimits)
+    certificate: Certificate = field(default_factory=Certificate)
     physics: Physics = field(default_factory=Physics)
     grid: Grid = PAPER_GRID
     catalogue: Catalogue = PAPER_CATALOGUE
@@ -87,20 +89,46 @@ class GenerateSettings:
             raise StackgenError("generate: validation and test are shares of the templates; their sum is at most 1")
         if not 0 <= self.draw <= self.stacks:
             raise StackgenError(f"generate: draw must lie in 0..stacks, got {self.draw}")
+        self.grid.require_room()
+        self.template.check(self.catalogue, self.grid)
+        thinnest = min(self.catalogue, key=lambda shape: shape.size[2])
+        if self.physics.fall_height >= thinnest.size[2]:
+            raise StackgenError(
+                f"generate: a fall of shape {thinnest.name!r} would go unseen;"
+                f" set physics.fall_height to {thinnest.size[2] / 2:g}, half its height"
+            )
 
     def to_json(self) -> dict[str, Any]:
         """Plain form without what the manifest stores elsewhere."""
         plain = asdict(replace(self, catalogue=PAPER_CATALOGUE))
         for key in ("name", "seed", "grid", "catalogue", "physics", "max_blocks"):
             plain.pop(key)
-        return json.loads(json.dumps(plain))
+        return {"revision": REVISION, **json.loads(json.dumps(plain))}
+
+    @staticmethod
+    def from_manifest(manifest: Manifest) -> GenerateSettings:
+        """The settings that a dataset was made with.
+
+        Raises:
+            StackgenError: If its manifest does not hold them, or holds those of another generator.
+        """
+        plain = {**_BEFORE, **{key: value for key, value in manifest.settings.items() if key != "revision"}}
+        physics = {key: value for key, value in manifest.physics.items() if key != "engine"}
+        world = {key: getattr(manifest, key) for key in ("name", "seed", "grid", "catalogue", "max_blocks")}
+        try:
+            return _revived(GenerateSettings, {**plain, **world, "physics": physics})
+        except (KeyError, TypeError) as error:
+            raise StackgenError(
+                f"dataset {manifest.name!r} was not made by this version of `stackgen generate`: {error}"
+            ) from error
 
     def split_of(self, shard: int) -> Split:
-        """The split of a shard; shares are met evenly along the way (multiples of the golden ratio)."""
-        place = shard * _GOLDEN % 1
-        if place < self.validation:
-            return "validation"
-        return "test" if place < self.validation + self.test else "train"
+        """The split of a shard."""
+        return split_of(shard, self.validation, self.test)
+
+
+_BEFORE = {"certificate": {"enabled": False}}
+"""What datasets are made with whose manifest does not say it, since it was not there yet."""
 
 
 def generate(
@@ -108,6 +136,8 @@ def generate(
     out: Path,
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
+    executor: Executor | None = None,
+    say: Callable[[str], None] | None = None,
 ) -> Manifest:
     """Make a dataset, or finish one that was interrupted.
 
@@ -116,47 +146,102 @@ def generate(
         out: Its folder.
         workers: Processes; by default one per core. The result does not depend on it.
         progress: Called with the number of stacks stored so far.
+        executor: Who makes the shards; by default processes of this machine.
+        say: Told of shards that were damaged in an interruption and are made again.
 
     Raises:
-        StackgenError: If the folder holds something else.
+        StackgenError: If the folder holds something else, a shard was damaged since the dataset was
+            complete, the disk is full, or workers die again and again.
     """
-    _claim(out, settings)
-    parts = out / "parts" if settings.draw else out  # what is drawn must not overwrite what it is drawn from
-    manifest = _finished(out)
-    if manifest is None:
-        parts.mkdir(exist_ok=True)
-        entries = _make_shards(settings, parts, workers or os.cpu_count() or 1, progress or (lambda stored: None))
-        if settings.draw:
-            entries = [_draw(out, parts, entries, settings)]
-        manifest = _manifest(settings, tuple(entries))
-        manifest.save(out)
-    if settings.draw:
-        shutil.rmtree(parts, ignore_errors=True)
-    known = {entry["file"] for entry in manifest.shards}
-    for path in [*out.glob("*.tar"), *out.glob(".*.tmp")]:  # of shards made ahead, and of killed writers
-        if path.name not in known:
-            path.unlink()
+    with disk_may_be_full(out):
+        claim(out, _manifest(settings, ()).to_json(), partial(_are, settings))
+        manifest = finished(out)
+        if manifest is None:
+            workshop = workshop_of(settings, out)
+            executor = executor or make_executor("local", workers)
+            entries = make_shards(settings, workshop, executor, progress, say)
+            if settings.draw:
+                entries = [_store(out, draw(workshop.folder, entries, settings))]
+            manifest = _manifest(settings, tuple(entries))
+            write_card(out, manifest)
+            manifest.save(out)
+        sweep(out, manifest)
     return manifest
+
+
+def generate_range(
+    settings: GenerateSettings,
+    out: Path,
+    shards: range,
+    executor: Executor | None = None,
+    progress: Callable[[int], None] | None = None,
+    say: Callable[[str], None] | None = None,
+) -> int:
+    """Make some shards of a dataset, for jobs that share its folder; :func:`generate` collects them.
+
+    Args:
+        settings: Of the whole dataset.
+        out: Its folder.
+        shards: Their numbers.
+        executor: Who makes them; by default processes of this machine.
+        progress: Called with the number of shards that are there so far.
+        say: Told of shards that were damaged in an interruption and are made again.
+
+    Returns:
+        How many stacks they hold; 0 if the dataset is complete already.
+    """
+    with disk_may_be_full(out):
+        claim(out, _manifest(settings, ()).to_json(), partial(_are, settings))
+        if finished(out) is not None:
+            return 0
+        workshop = workshop_of(settings, out)
+        known = workshop.whole(say or _ignore, shards)
+        missing = [number for number in shards if number not in known]
+        made = (executor or make_executor("local")).map(ShardTask.of(settings), missing)
+        with contextlib.closing(made):
+            for number, shard in made:
+                known[number] = workshop.keep(number, shard)
+                (progress or _ignore)(len(known))
+    return sum(entry["samples"] for entry in known.values())
 
 
 def testset_layouts(catalogue: Catalogue, grid: Grid) -> set[str]:
     """Layouts of the templates that `testset-v1` was made from, and their mirror images, in the numbers of
     another catalogue: shapes are the same if name and outline are."""
-    if not (TESTSET / "dataset.json").exists():
-        return set()
-    manifest = Manifest.load(TESTSET)
+    return set(_layouts_of(TESTSET, catalogue, grid))
+
+
+@cache
+def _layouts_of(testset: Path, catalogue: Catalogue, grid: Grid) -> frozenset[str]:
+    if not (testset / "dataset.json").exists():
+        return frozenset()
+    manifest = Manifest.load(testset)
     if (grid.width, grid.height) != (manifest.grid.width, manifest.grid.height):
-        return set()
+        return frozenset()
     numbers = {
         i: catalogue.shapes.index(shape) for i, shape in enumerate(manifest.catalogue) if shape in catalogue.shapes
     }
     layouts: set[str] = set()
-    for key in {sample.meta["layout"] for sample in manifest.samples(TESTSET, "test")}:
+    for key in {sample.meta["layout"] for sample in manifest.samples(testset, "test")}:
         rows = Template.from_key(key).rows
         if all(shape in numbers for row in rows for shape, _ in row):
             template = Template(tuple(tuple((numbers[shape], left) for shape, left in row) for row in rows))
             layouts |= {template.key, template.mirrored(catalogue, grid).key}
-    return layouts
+    return frozenset(layouts)
+
+
+def _revived(kind: type[Any], plain: Mapping[str, Any]) -> Any:
+    """A dataclass of dataclasses from its plain form; what is no longer plain is taken as it is."""
+    hints = get_type_hints(kind)
+    unknown = set(plain) - {item.name for item in fields(kind)}
+    if unknown:
+        raise TypeError(f"unknown settings {', '.join(sorted(unknown))}")
+    values = {}
+    for name, value in plain.items():
+        if is_dataclass(hints[name]) and isinstance(value, Mapping):
+            value = _revived(hints[name], value)
+        values[name] = tuple(value) if isinstance(value, list) else value
+    return kind(**values)
 
 
 def template_samples(
@@ -168,121 +253,102 @@ def template_samples(
     if template.key in excluded:
         return []
     start = realize(template, rng, settings.template, settings.catalogue, settings.grid)
-    judge = Judge(simulator, settings.accept, settings.settle_twice)
+    judge = Judge(simulator, settings.accept, settings.settle_twice, settings.certificate)
+    pictures = Pictures(settings.grid)
     samples = []
     for removed, stack in deconstruct(start, judge, settings.max_removals):
         if len(stack) > settings.max_blocks:
             continue
         poses = stack.poses.astype(np.float32)
-        picture = silhouette(stack.with_poses(poses), "front", settings.grid)
+        picture = pictures.front(stack.with_poses(poses))
         key = f"{number:08d}-{'.'.join(f'{b:02d}' for b in removed) or 'whole'}".replace(".", "_")
         meta = {"template": number, "layout": template.key, "removed": list(removed)}
         samples.append(Sample(key, stack.shapes.astype(np.uint8), poses, picture, meta))
     return samples
 
 
-def _make_shards(
-    settings: GenerateSettings, out: Path, workers: int, progress: Callable[[int], None]
-) -> list[dict[str, Any]]:
+@dataclass(frozen=True)
+class ShardTask:
+    """What a worker does: the shard of a number.
+
+    Args:
+        settings: Of the dataset.
+        excluded: Layouts to leave out.
+    """
+
+    settings: GenerateSettings
+    excluded: frozenset[str]
+
+    @staticmethod
+    def of(settings: GenerateSettings) -> ShardTask:
+        """The task of a dataset."""
+        layouts = testset_layouts(settings.catalogue, settings.grid) if settings.exclude_testset else set()
+        return ShardTask(settings, frozenset(layouts))
+
+    def __call__(self, shard: int) -> Shard:
+        """Make one shard."""
+        settings = self.settings
+        first = shard * settings.templates_per_shard
+        with Simulator(settings.physics, settings.catalogue) as simulator:
+            samples = [
+                sample
+                for number in range(first, first + settings.templates_per_shard)
+                for sample in template_samples(settings, number, self.excluded, simulator)
+            ]
+        return Shard(f"{settings.split_of(shard)}-{shard:06d}.tar", encode_shard(samples), len(samples))
+
+
+def make_shards(
+    settings: GenerateSettings,
+    workshop: Workshop,
+    executor: Executor,
+    progress: Callable[[int], None] | None = None,
+    say: Callable[[str], None] | None = None,
+) -> list[Entry]:
     """Write as many shards as it takes, the last one cut to size; returns the entries of those not empty."""
-    excluded = (
-        frozenset(testset_layouts(settings.catalogue, settings.grid)) if settings.exclude_testset else frozenset()
-    )
-    entries: list[dict[str, Any]] = []
+    progress, say = progress or _ignore, say or _ignore
+    known = workshop.whole(say)
+    entries: list[Entry] = []
     stored = 0
-    for shard, entry in enumerate(_shards_in_order(settings, out, excluded, workers)):
-        stored += entry["samples"]
-        progress(min(stored, settings.stacks))
-        if entry["samples"]:
-            entries.append(entry)
-        if stored >= settings.stacks:
-            break
-        if not stored and shard * settings.templates_per_shard > _HOPELESS:
-            raise StackgenError(f"generate: {_HOPELESS} templates gave no stack; relax max_blocks, accept or template")
-    entries[-1] = _trim(out, entries[-1], entries[-1]["samples"] - (stored - settings.stacks))
+    made = executor.map(ShardTask.of(settings), (number for number in count() if number not in known))
+    with contextlib.closing(made):
+        for shard in count():
+            while shard not in known:
+                number, new = next(made)
+                known[number] = workshop.keep(number, new)
+            entry = known[shard]
+            stored += entry["samples"]
+            progress(min(stored, settings.stacks))
+            if entry["samples"]:
+                entries.append(entry)
+            if stored >= settings.stacks:
+                break
+            if not stored and shard * settings.templates_per_shard > _HOPELESS:
+                raise StackgenError(
+                    f"generate: {_HOPELESS} templates gave no stack; relax max_blocks, accept or template"
+                )
+    entries[-1] = workshop.trim(entries[-1], entries[-1]["samples"] - (stored - settings.stacks))
     return entries
 
 
-def _make_shard(settings: GenerateSettings, out: Path, shard: int, excluded: frozenset[str]) -> dict[str, Any]:
-    """Write one shard, unless it is there; returns its manifest entry."""
-    path = out / f"{settings.split_of(shard)}-{shard:06d}.tar"
-    first = shard * settings.templates_per_shard
-    if path.exists():
-        return _entry(path)
-    with Simulator(settings.physics, settings.catalogue) as simulator:
-        samples = [
-            sample
-            for number in range(first, first + settings.templates_per_shard)
-            for sample in template_samples(settings, number, excluded, simulator)
-        ]
-    return write_shard(path, samples)
+def workshop_of(settings: GenerateSettings, out: Path) -> Workshop:
+    """Where the shards are made: what is drawn must not overwrite what it is drawn from."""
+    folder = out / PARTS if settings.draw else out
+    folder.mkdir(exist_ok=True)
+    return Workshop(folder)
 
 
-def _entry(path: Path) -> dict[str, Any]:
-    return write_shard(path, list(read_shard(path)))
-
-
-def _shards_in_order(
-    settings: GenerateSettings, out: Path, excluded: frozenset[str], workers: int
-) -> Iterator[dict[str, Any]]:
-    """Manifest entries of shard 0, 1, 2, ..., made ahead by a pool of processes."""
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent)
-    waiting: dict[int, Future[dict[str, Any]]] = {}
-    ahead = 0
-    shard = 0
+def _are(settings: GenerateSettings, plain: Any) -> bool:
+    """Whether a plain manifest without shards is that of some settings, with what it does not say filled in."""
     try:
-        while True:
-            while len(waiting) < 2 * workers:
-                with _without_interrupts():
-                    waiting[ahead] = pool.submit(_make_shard, settings, out, ahead, excluded)
-                ahead += 1
-            while not waiting[shard].done():
-                wait([waiting[shard]], timeout=1, return_when=FIRST_COMPLETED)
-            yield waiting.pop(shard).result()
-            shard += 1
-    finally:
-        for process in list(getattr(pool, "_processes", {}).values()):
-            process.terminate()
-        pool.shutdown(wait=False, cancel_futures=True)
+        manifest = Manifest.from_json(plain)
+        same = manifest.settings.get("revision", REVISION) == REVISION
+        return same and manifest.physics == settings.physics.to_json() and settings.from_manifest(manifest) == settings
+    except StackgenError:
+        return False
 
 
-@contextlib.contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Processes that start here never see Ctrl-C: the parent alone answers it."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _end_with_parent() -> None:
-    """In a worker: end when the parent is gone, even if it was killed; a pool's workers would wait forever."""
-
-    def follow() -> None:
-        parent = multiprocessing.parent_process()
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
-
-
-def _finished(out: Path) -> Manifest | None:
-    """The manifest, if all is there that it names."""
-    if not (out / "dataset.json").exists():
-        return None
-    manifest = Manifest.load(out)
-    files = {path.name: path for path in out.glob("*.tar")}
-    for entry in manifest.shards:
-        path = files.get(entry["file"])
-        if path is None or hashlib.sha256(path.read_bytes()).hexdigest() != entry["sha256"]:
-            return None
-    return manifest
-
-
-def _manifest(settings: GenerateSettings, entries: tuple[dict[str, Any], ...]) -> Manifest:
+def _manifest(settings: GenerateSettings, entries: tuple[Entry, ...]) -> Manifest:
     return Manifest(
         settings.name,
         settings.seed,
@@ -295,31 +361,18 @@ def _manifest(settings: GenerateSettings, entries: tuple[dict[str, Any], ...]) -
     )
 
 
-def _claim(out: Path, settings: GenerateSettings) -> None:
-    """Make the folder this dataset's own, or see that it already is."""
-    mine = json.dumps(_manifest(settings, ()).to_json(), sort_keys=True, indent=1)
-    claim = out / "generate.json"
-    out.mkdir(parents=True, exist_ok=True)
-    if claim.exists():
-        if claim.read_text() != mine:
-            raise StackgenError(f"{out} holds a dataset made with other settings; choose another folder or delete it")
-    elif any(out.glob("*.tar")):
-        raise StackgenError(f"{out} holds shards, but no generate.json that says of what; choose another folder")
-    else:
-        write_atomically(claim, mine.encode())
-
-
-def _trim(out: Path, entry: dict[str, Any], keep: int) -> dict[str, Any]:
-    """Cut a shard to its first samples."""
-    if keep >= entry["samples"]:
-        return entry
-    path = out / entry["file"]
-    return write_shard(path, list(read_shard(path))[:keep])
-
-
-def _draw(out: Path, parts: Path, entries: list[dict[str, Any]], settings: GenerateSettings) -> dict[str, Any]:
-    """Keep `settings.draw` stacks of all, drawn uniformly, in one shard."""
-    samples = [sample for entry in entries for sample in read_shard(parts / entry["file"])]
+def draw(folder: Path, entries: list[Entry], settings: GenerateSettings) -> Shard:
+    """Keep `settings.draw` stacks of all in a folder's shards, drawn uniformly, in one shard."""
+    samples = [sample for entry in entries for sample in read_shard(folder / entry["file"], entry["sha256"])]
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(2**32,)))
     chosen = np.sort(rng.choice(len(samples), settings.draw, replace=False))
-    return write_shard(out / entries[0]["file"], [samples[i] for i in chosen])
+    return Shard(entries[0]["file"], encode_shard(samples[i] for i in chosen), len(chosen))
+
+
+def _store(folder: Path, shard: Shard) -> Entry:
+    write_atomically(folder / shard.name, shard.content)
+    return shard_entry(shard.name, shard.content, shard.samples)
+
+
+def _ignore(_: object) -> None:
+    """Nobody wants to know."""

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from stackgen.geometry import PAPER_GRID, Grid
-from stackgen.stack import PAPER_CATALOGUE, Catalogue, Stack
+from stackgen.stack import PAPER_CATALOGUE, Catalogue, Shape, Stack, StackgenError
+
+_EPSILON = 1e-6  # [cell]
 
 
 @dataclass(frozen=True)
@@ -15,7 +19,7 @@ class TemplateSettings:
     """How designs are drawn.
 
     Args:
-        minimum_fill: A row is finished once at least this many cells are occupied.
+        minimum_fill: A row is finished once at least this many of its cells are occupied.
         displacement: Each block's x is shifted uniformly within this [cell].
         top_row_only: Shapes that may stand in the top row alone (nothing rests on them).
     """
@@ -23,6 +27,51 @@ class TemplateSettings:
     minimum_fill: int = 3
     displacement: float = 0.1
     top_row_only: tuple[str, ...] = ("triangle",)
+
+    def check(self, catalogue: Catalogue, grid: Grid) -> None:
+        """See that designs can be drawn with these settings, and that their blocks can stand.
+
+        Raises:
+            StackgenError: If a row cannot be filled, or a shape cannot stand or bear where it may be put.
+        """
+        unknown = set(self.top_row_only) - {*catalogue.names, *TemplateSettings().top_row_only}
+        if unknown:
+            raise StackgenError(f"template: top_row_only names {', '.join(sorted(unknown))}: not in the catalogue")
+        lower = [shape for shape in catalogue if shape.name not in self.top_row_only]
+        if not lower:
+            raise StackgenError("template: a shape must be left that may stand below the top row; see top_row_only")
+        if self.displacement < 0 or not 1 <= self.minimum_fill <= grid.width:
+            raise StackgenError(
+                f"template: displacement must be at least 0 and minimum_fill lie in 1..{grid.width}, the grid's width"
+            )
+        for shape in catalogue:
+            self._check_shape(shape, lower, grid)
+
+    def _check_shape(self, shape: Shape, lower: Sequence[Shape], grid: Grid) -> None:
+        name = f"template: shape {shape.name!r}"
+        stands, bears = shape.level
+        if not stands:
+            raise StackgenError(f"{name} has no level edge at its bottom to stand on")
+        if not bears and shape in lower:
+            raise StackgenError(f"{name} has no level edge at its top to bear others; name it in top_row_only")
+        if cells_wide(shape) > grid.width or shape.size[2] > grid.height + _EPSILON:
+            raise StackgenError(f"{name} is larger than the {grid.width} x {grid.height} grid")
+        row = [other for other in lower if _same_height(other, shape)] or [shape]
+        most = grid.width - min(cells_wide(other) for other in row) + 1
+        if self.minimum_fill > most:
+            raise StackgenError(
+                f"{name} may leave its row with less than {self.minimum_fill} of {grid.width} cells filled;"
+                f" set minimum_fill to {most} or add a narrower shape of its height"
+            )
+
+
+def cells_wide(shape: Shape) -> int:
+    """Cells of a row that a shape takes up."""
+    return math.ceil(shape.size[0] - _EPSILON)
+
+
+def _same_height(a: Shape, b: Shape) -> bool:
+    return abs(a.size[2] - b.size[2]) < _EPSILON
 
 
 @dataclass(frozen=True)
@@ -46,7 +95,7 @@ class Template:
         """The design reflected left to right."""
         return Template(
             tuple(
-                tuple((s, grid.width - left - round(catalogue[s].size[0])) for s, left in reversed(row))
+                tuple((s, grid.width - left - cells_wide(catalogue[s])) for s, left in reversed(row))
                 for row in self.rows
             )
         )
@@ -59,17 +108,30 @@ def draw_template(
     grid: Grid = PAPER_GRID,
 ) -> Template:
     """Fill the grid row by row with random blocks, never wider than the grid, until a row holds the
-    minimum; the cells left free go, each on its own, to random gaps between and beside the blocks."""
+    minimum; the cells left free go, each on its own, to random gaps between and beside the blocks.
+
+    The blocks of a row are of one height, that of its first; rows follow until none fits below the
+    grid's upper edge.
+    """
     settings = settings or TemplateSettings()
-    widths = [round(shape.size[0]) for shape in catalogue]
-    anywhere = [i for i, shape in enumerate(catalogue) if shape.name not in settings.top_row_only]
-    rows = []
-    for level in range(grid.height):
-        choices = range(len(catalogue)) if level == grid.height - 1 else anywhere
+    widths = [cells_wide(shape) for shape in catalogue]
+    heights = [shape.size[2] for shape in catalogue]
+    rows: list[tuple[tuple[int, int], ...]] = []
+    room = grid.height + _EPSILON
+    while room >= min(heights):
+        choices = [
+            i
+            for i, shape in enumerate(catalogue)
+            if heights[i] <= room and (shape.name not in settings.top_row_only or room - heights[i] < min(heights))
+        ]
+        if not choices:
+            break
         row: list[int] = []
         while sum(widths[s] for s in row) < settings.minimum_fill:
             fitting = [s for s in choices if sum(widths[t] for t in row) + widths[s] <= grid.width]
             row.append(int(rng.choice(fitting)))
+            choices = [s for s in choices if _same_height(catalogue[s], catalogue[row[0]])]
+        room -= heights[row[0]]
         free = grid.width - sum(widths[s] for s in row)
         gaps = np.bincount(rng.integers(0, len(row) + 1, size=free), minlength=len(row) + 1)
         left, placed = 0, []
@@ -95,8 +157,9 @@ def realize(
     bottom = 0.0
     for row in template.rows:
         widths = np.array([catalogue[s].size[0] for s, _ in row])
+        cells = np.array([cells_wide(catalogue[s]) for s, _ in row])
         lefts = np.array([left for _, left in row]) - grid.width / 2
-        x = lefts + widths / 2 + rng.uniform(-settings.displacement, settings.displacement, len(row))
+        x = lefts + cells / 2 + rng.uniform(-settings.displacement, settings.displacement, len(row))
         x = _separate(x, widths)
         for (shape, _), center in zip(row, x, strict=True):
             shapes.append(shape)

@@ -1,0 +1,270 @@
+"""stackgen dataset: is it whole, make it whole, what is in it, split it anew, one file of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from stackgen.commands import Command, Files, epilog
+from stackgen.commands.progress import progress_bar
+from stackgen.data.card import write_card
+from stackgen.data.generation.executors import ExecutorName
+from stackgen.data.resplit import By, Resplit, resplit, split_table
+from stackgen.data.shards import SPLITS, Manifest
+from stackgen.files import write_atomically
+from stackgen.stack import StackgenError
+
+TRAVELS = 64 * 2**20
+"""Largest compact file that is easy to send along [byte]."""
+
+
+def verify(folder: Path) -> int:
+    """Compare every shard with its checksum and read every stack; exit code 1 if anything is wrong.
+
+    Args:
+        folder: Of the dataset.
+    """
+    from stackgen.data.verification import verify as find_problems
+
+    manifest = Manifest.load(folder)
+    with progress_bar("verifying", len(manifest.shards)) as (advance, _):
+        problems = find_problems(folder, advance)
+    if not problems:
+        stacks = sum(manifest.count(split) for split in SPLITS)
+        print(f"{folder}: {len(manifest.shards)} shards with {stacks:,} stacks are as they were written")
+        return 0
+    table = Table("file", "is", "", box=None, pad_edge=False)
+    for problem in problems:
+        table.add_row(escape(problem.file), f"[red]{problem.fault}[/]", escape(problem.detail))
+    Console().print(table)
+    if any(problem.breaks_bytes for problem in problems):
+        print(f"make the lost shards again: stackgen dataset repair {folder}")
+    return 1
+
+
+def repair(
+    folder: Path, workers: int | None = None, executor: ExecutorName = "local", other_bytes: bool = False
+) -> None:
+    """Make the shards again that are missing or damaged, byte for byte; all others are left alone.
+
+    Args:
+        folder: Of the dataset.
+        workers: Processes; by default one for each core.
+        executor: Processes of this machine, or tasks of a Ray cluster.
+        other_bytes: Accept shards that are not what was written, where this version of the simulator makes
+            others; dataset.json then gets their checksums.
+    """
+    from stackgen.data.generation.executors import make_executor
+    from stackgen.data.generation.repair import repair as make_again
+
+    with progress_bar("making shards again") as (advance, _):
+        done = make_again(folder, make_executor(executor, workers), other_bytes, advance)
+    for name in done.identical:
+        print(f"made {folder / name} again, byte for byte")
+    for name in done.other:
+        print(f"made {folder / name} anew, with other bytes: dataset.json and the dataset's hash have changed")
+    if not done.identical and not done.other:
+        print(f"{folder}: every shard is as it was written; nothing to repair")
+
+
+def info(folder: Path, out: Path | None = None, margins: int = 500, samples: int = 24, seed: int = 0) -> None:
+    """Count, measure and draw what is in a dataset, and how near the frozen test scenes are to it.
+
+    Args:
+        folder: Of the dataset, or its compact .npz.
+        out: Folder for info.json, info.png and samples.png; by default the dataset's own, whose card then
+            gets the figures, too. Beside a compact file nothing is written without it.
+        margins: Stacks whose margin statics is asked for; 0 for none.
+        samples: Random stacks on the contact sheet; 0 for none.
+        seed: Of both draws.
+    """
+    from stackgen.data.figures import draw_facts, draw_samples, paragraphs
+    from stackgen.data.inspection import Contents, describe_margins, facts, sample_margins
+    from stackgen.render import save_image
+
+    if margins < 0 or samples < 0:
+        raise StackgenError("dataset info: margins and samples must be at least 0")
+    contents = Contents.load(folder)
+    found = facts(contents, None if folder.resolve() == _testset().resolve() else _testset())
+    held = None
+    if margins:
+        held = sample_margins(contents, _statics(contents.manifest), margins, seed)
+        found["margins"] = describe_margins(held)
+    _print_facts(found)
+    place = out or (folder if folder.is_dir() else None)
+    if place is None:
+        return
+    place.mkdir(parents=True, exist_ok=True)
+    write_atomically(place / "info.json", (json.dumps(found, indent=1, allow_nan=False) + "\n").encode())
+    draw_facts(place / "info.png", contents, found, held)
+    written = ["info.json", "info.png"]
+    if samples:
+        save_image(place / "samples.png", draw_samples(contents, samples, seed))
+        written.append("samples.png")
+    if out is None and write_card(folder, contents.manifest, paragraphs(found, written[1:])):
+        written.append("README.md")
+    print("\n".join(f"wrote {place / name}" for name in written))
+
+
+def split(
+    folder: Path,
+    validation: float | None = None,
+    test: float | None = None,
+    by: By = "template",
+    seed: int = 0,
+    out: Path | None = None,
+) -> None:
+    """Say how a dataset is split, or write it anew with other shares: what belongs together stays on one side.
+
+    Args:
+        folder: Of the dataset.
+        validation: Share of the validation split in the new dataset; 0 if only the other share is given.
+        test: Share of the test split in the new dataset; 0 if only the other share is given.
+        by: What stays together: `template`, all stacks deconstructed from one template; `layout`, those of all
+            templates that are the same design or its mirror image.
+        seed: Another one, another choice.
+        out: Folder of the new dataset; without it the present split is printed.
+    """
+    manifest = Manifest.load(folder)
+    asked = validation is not None or test is not None
+    if asked != (out is not None):
+        raise StackgenError("dataset split: a new split needs --out and one of --validation and --test")
+    if out is not None:
+        how = Resplit(validation or 0.0, test or 0.0, by, seed)
+        with progress_bar("splitting", len(manifest.shards)) as (advance, _):
+            manifest, folder = resplit(folder, out, how, advance), out
+    with progress_bar("counting", len(manifest.shards)) as (advance, _):
+        rows = split_table(folder, manifest, advance)
+    table = Table("split", *next(iter(rows.values())), box=None, pad_edge=False)
+    for column in table.columns[1:]:
+        column.justify = "right"
+    for name, row in rows.items():
+        table.add_row(name, *(f"{number:,}" for number in row.values()))
+    Console().print(table)
+    if out is not None:
+        print(f"wrote {out}; sha256 {manifest.sha256[:12]}")
+
+
+def export(folder: Path, out: Path) -> None:
+    """Write a whole dataset as one compact file of arrays, for a machine that only trains.
+
+    Args:
+        folder: Of the dataset.
+        out: File to write, ending in .npz; `--data.path` takes it.
+    """
+    from stackgen.data.arrays import load_dataset, save_npz
+
+    splits, facts = load_dataset(folder)
+    save_npz(out, splits, facts)
+    size = out.stat().st_size
+    large = "" if size <= TRAVELS else f" (more than the {TRAVELS / 2**20:g} MiB that are easy to send along)"
+    print(f"wrote {out}: {sum(map(len, splits.values())):,} stacks, {size / 2**20:.1f} MiB{large}")
+
+
+def _testset() -> Path:
+    from stackgen.data.generation.generate import TESTSET
+
+    return TESTSET
+
+
+def _statics(manifest: Manifest) -> Any:
+    """Statics with the friction that the dataset was made with."""
+    from stackgen.sim.equilibrium import EquilibriumChecker  # loads a solver that nothing else needs
+    from stackgen.sim.physics import Physics
+
+    friction = manifest.physics.get("friction", Physics().friction)
+    return EquilibriumChecker(Physics(friction=float(friction)))
+
+
+def _print_facts(found: Mapping[str, Any]) -> None:
+    """What `dataset info` found, for the terminal."""
+    from stackgen.data.figures import duplicate_words, margin_words, nearness_words
+
+    console = Console()
+    console.print(f"[bold]{escape(found['name'])}[/]: {found['stacks']:,} stacks")
+    for name, tally in found["counts"].items():
+        table = Table(escape(name), *tally, box=None, pad_edge=False)
+        table.add_row("", *(f"{number:,}" for number in tally.values()))
+        console.print("", table, sep="\n")
+    table = Table("of all blocks", *next(iter(found["distributions"].values())), box=None, pad_edge=False)
+    for name, values in found["distributions"].items():
+        table.add_row(escape(name), *(f"{value:.4f}" for value in values.values()))
+    console.print("", table, sep="\n")
+    for words in (margin_words(found), duplicate_words(found), *nearness_words(found)):
+        if words:
+            console.print("", escape(words), sep="\n", highlight=False)
+
+
+_FOLDER = Files("folder", "FOLDER", "Folder of the dataset.")
+
+COMMANDS = {
+    "verify": Command("dataset verify", verify, "stackgen dataset verify data/paper", files=_FOLDER),
+    "repair": Command(
+        "dataset repair",
+        repair,
+        "stackgen dataset repair data/paper\nstackgen dataset repair data/paper --workers 4",
+        files=_FOLDER,
+        flags={"other_bytes": "Accept shards that are not what was written; dataset.json gets their checksums."},
+    ),
+    "info": Command(
+        "dataset info",
+        info,
+        "stackgen dataset info data/paper\nstackgen dataset info data/paper.npz --out out/paper --margins 2000",
+        files=Files("folder", "FOLDER", "Folder of the dataset, or its compact .npz."),
+    ),
+    "split": Command(
+        "dataset split",
+        split,
+        "stackgen dataset split data/paper\n"
+        "stackgen dataset split data/paper --validation 0.05 --test 0.1 --out data/other\n"
+        "stackgen dataset split data/paper --validation 0.05 --test 0.1 --by layout --out data/strict",
+        files=_FOLDER,
+    ),
+    "export": Command(
+        "dataset export",
+        export,
+        "stackgen dataset export data/paper --out data/paper.npz",
+        files=_FOLDER,
+    ),
+}
+
+EXAMPLES = {name: command.example for name, command in COMMANDS.items()}
+
+
+EXAMPLES = {action: command.example for action, command in COMMANDS.items()}
+
+
+def run(verb: str, argv: Sequence[str]) -> int | None:
+    """Run one of the actions."""
+    if not argv or argv[0] in ("-h", "--help"):
+        print(usage())
+        return 0
+    action, *rest = argv
+    if action not in COMMANDS:
+        near = get_close_matches(action, COMMANDS, n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(COMMANDS)}"
+        raise StackgenError(f"unknown action {action!r}: {hint}")
+    return COMMANDS[action].run(rest)
+
+
+def usage() -> str:
+    """The actions, for `stackgen dataset --help`."""
+    width = max(map(len, COMMANDS))
+    rows = [
+        f"  {name:<{width}}  {(command.function.__doc__ or '').partition(chr(10))[0]}"
+        for name, command in COMMANDS.items()
+    ]
+    head = [
+        "usage: stackgen dataset ACTION FOLDER ... | stackgen dataset ACTION --help",
+        "",
+        "Look after a dataset.",
+        "",
+    ]
+    return "\n".join([*head, *rows, "", epilog("stackgen dataset info data/paper")])

@@ -1,0 +1,48 @@
+"""The progress bar of long jobs, on stderr and for people alone."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Protocol
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+
+class Advance(Protocol):
+    """Told how much is done, and of how much if that was not known before."""
+
+    def __call__(self, done: int, total: int | None = None) -> None:
+        """Move the bar."""
+        ...
+
+
+@contextmanager
+def progress_bar(what: str, total: int | None = None) -> Iterator[tuple[Advance, Callable[[str], None]]]:
+    """Show a bar until the block ends.
+
+    Args:
+        what: Is being done.
+        total: Of how much; None as long as that is not known.
+
+    Yields:
+        A function that moves the bar, and one that prints a line above it; the line also comes out where there
+        is no terminal for the bar.
+    """
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    screen = Console(stderr=True)
+    with Progress(*columns, console=screen, disable=not screen.is_terminal) as progress:
+        task = progress.add_task(what, total=total)
+
+        def advance(done: int, total: int | None = None) -> None:
+            progress.update(task, completed=done, total=total)
+
+        yield advance, lambda line: screen.print(escape(line), highlight=False, soft_wrap=True)

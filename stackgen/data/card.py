@@ -1,0 +1,163 @@
+"""The card that comes with a dataset: its README.md, for people who have the folder and nothing else.
+
+It is made from the manifest alone, so equal datasets have equal cards; `stackgen dataset info` adds what it measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from stackgen.data.shards import FORMAT, SPLITS, Manifest
+from stackgen.files import write_atomically
+
+CARD = "README.md"
+MARK = "<!-- Dataset card, written by stackgen: what is changed here by hand is lost when it is written again. -->"
+
+_READING = """```python
+import io
+import json
+
+import numpy as np
+import webdataset
+
+for sample in webdataset.WebDataset("{shard}", shardshuffle=False):
+    shapes = np.load(io.BytesIO(sample["shapes.npy"]))  # (k,) places in the catalogue
+    poses = np.load(io.BytesIO(sample["poses.npy"]))  # (k, 6) x, y, z [cell] and rotation vector [rad]
+    packed = np.load(io.BytesIO(sample["silhouette.npy"]))
+    silhouette = np.unpackbits(packed, axis=1).astype(bool)  # {pixels} x {pixels}, first row at the top
+    meta = json.loads(sample["meta.json"])  # template, layout, removed
+    break
+```"""
+
+
+def write_card(folder: Path, manifest: Manifest, measured: Sequence[str] = ()) -> bool:
+    """Write a dataset's card; a README.md that is not ours is left alone.
+
+    Args:
+        folder: Of the dataset.
+        manifest: Its manifest.
+        measured: Paragraphs on what is in it, for the section of that name.
+
+    Returns:
+        Whether it was written.
+
+    Raises:
+        StackgenError: If it cannot be written.
+    """
+    path = folder / CARD
+    if path.exists() and not path.read_bytes().startswith(MARK.encode()):
+        return False
+    write_atomically(path, dataset_card(manifest, measured).encode())
+    return True
+
+
+def dataset_card(manifest: Manifest, measured: Sequence[str] = ()) -> str:
+    """The text of a card, Markdown."""
+    stacks = sum(manifest.count(split) for split in SPLITS)
+    example = manifest.shards[0]["file"] if manifest.shards else "train-000000.tar"
+    reading = _READING.format(shard=example, pixels=manifest.grid.image_size)
+    sections = {
+        "": _about(manifest, stacks),
+        "Counts": markdown_table(
+            ["split", "stacks", "shards"],
+            [
+                [split, f"{manifest.count(split):,}", str(sum(s["split"] == split for s in manifest.shards))]
+                for split in SPLITS
+            ],
+        ),
+        "How it was made": _making(manifest),
+        "Blocks": _blocks(manifest),
+        "Physics": _physics(manifest),
+        "Reading it": f"A sample is four members of a tar that share a key ({FORMAT}):\n\n{reading}\n\n"
+        "With stackgen: `--data.path FOLDER` trains on it, `stackgen dataset verify FOLDER` checks every byte.",
+        "Limits": _limits(manifest),
+    }
+    if measured:
+        sections["What is in it"] = "\n\n".join(measured)
+    title = f"# {manifest.name}: {stacks:,} stacks of blocks that stand"
+    parts = [MARK, title, *(f"## {name}\n\n{text}" if name else text for name, text in sections.items())]
+    return "\n\n".join(parts) + "\n"
+
+
+def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table whose first column is text and whose others are figures.
+
+    >>> print(markdown_table(["a", "b"], [["x", "1"]]))
+    | a | b |
+    | --- | ---: |
+    | x | 1 |
+    """
+    lines = [headings, ["---", *["---:"] * (len(headings) - 1)], *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _about(manifest: Manifest, stacks: int) -> str:
+    grid = manifest.grid
+    return (
+        f"{stacks:,} stacks of at most {manifest.max_blocks} blocks on a {grid.width} x {grid.height} grid, each "
+        f"settled in a physics simulator, with its front silhouette ({grid.image_size} x {grid.image_size} pixels, "
+        f"{grid.pixels_per_cell:g} a cell). For learning to build a stable structure of a given silhouette. "
+        "The checksum of every shard is in `dataset.json`."
+    )
+
+
+def _making(manifest: Manifest) -> str:
+    s = manifest.settings
+    if "template" not in s:
+        return "`dataset.json` does not say."
+    fill, shift = s["template"]["minimum_fill"], s["template"]["displacement"]
+    accept, twice = s["accept"], " twice" if s.get("settle_twice") else ""
+    lines = [
+        f"By construction and deconstruction, seed {manifest.seed}. Rows are filled from the bottom with random blocks "
+        f"until at least {fill} of {manifest.grid.width} cells are occupied; each block is shifted along x within "
+        f"{shift:g} cell. The design is simulated{twice} and kept if it comes to rest, no block moved by more than "
+        f"{accept['displacement']:g} cell along an axis or leaned by more than {accept['tilt']:g} rad. From what "
+        f"stands, up to {s['max_removals']} blocks are removed one at a time, and each rest is judged in the same way."
+    ]
+    if s.get("draw"):
+        lines.append(f"Of {s['stacks']:,} stacks made so, {s['draw']:,} were drawn uniformly without replacement.")
+    if s.get("exclude_testset"):
+        lines.append("Designs that `testset-v1` uses, and their mirror images, are left out.")
+    lines.append(
+        f"All stacks made from one design are in one split. Shares asked for: validation {s['validation']:g}, test "
+        f"{s['test']:g}, counted in designs."
+    )
+    if "resplit" in s:
+        split = s["resplit"]
+        lines.append(
+            f"Split again by {split['by']}: validation {split['validation']:g}, test {split['test']:g}, seed "
+            f"{split['seed']}; from the dataset with manifest hash `{split['source']}`."
+        )
+    return "\n".join(lines)
+
+
+def _blocks(manifest: Manifest) -> str:
+    rows = [
+        [f"{index}: {shape.name}", *(f"{extent:g}" for extent in shape.size), f"{shape.volume:g}"]
+        for index, shape in enumerate(manifest.catalogue)
+    ]
+    return markdown_table(["shape", "width [cell]", "depth [cell]", "height [cell]", "volume [cell^3]"], rows)
+
+
+def _physics(manifest: Manifest) -> str:
+    rows = [[name, _figure(value)] for name, value in manifest.physics.items()]
+    return (
+        "A verdict holds for these numbers alone; lengths in metres unless stackgen's docs/physics.md says cells.\n\n"
+        + markdown_table(["setting", "value"], rows)
+    )
+
+
+def _limits(manifest: Manifest) -> str:
+    shift = manifest.settings.get("template", {}).get("displacement", 0.1)
+    return (
+        "Designs are two-dimensional: all blocks stand at y = 0 with yaw 0 but for what settling does, and within "
+        f"{shift:g} cell of a grid. They are random, not what people would build. Stable means stable in this "
+        "simulator: rigid blocks, one friction coefficient, uniform density, placed all at once; marginal stacks may "
+        "fall under other settings. Equal settings give equal bytes on one kind of machine and one set of versions."
+    )
+
+
+def _figure(value: Any) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)

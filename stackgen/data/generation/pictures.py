@@ -1,0 +1,32 @@
+"""Silhouettes of stacks that share blocks: what is left of a stack is drawn from what was drawn before."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from stackgen.geometry import Grid, Mask, silhouette
+from stackgen.stack import Stack
+
+
+class Pictures:
+    """Front silhouettes, each block in its place drawn once.
+
+    Args:
+        grid: Scale of the pictures.
+    """
+
+    def __init__(self, grid: Grid) -> None:
+        self.grid = grid
+        self._drawn: dict[tuple[int, bytes], Mask] = {}
+
+    def front(self, stack: Stack) -> Mask:
+        """`silhouette(stack, "front", grid)`."""
+        picture = np.zeros((self.grid.image_size, self.grid.image_size), dtype=bool)
+        for shape, pose in zip(stack.shapes.tolist(), stack.poses, strict=True):
+            place = (shape, pose.tobytes())
+            if place not in self._drawn:
+                self._drawn[place] = silhouette(
+                    Stack(np.array([shape]), pose[None], stack.catalogue), "front", self.grid
+                )
+            picture |= self._drawn[place]
+        return picture

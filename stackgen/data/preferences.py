@@ -1,0 +1,169 @@
+"""Pairs of stacks for one silhouette and block list, one better than the other: what verdicts teach.
+
+A sampler's own failures say what its training data cannot: which layouts it is tempted by and must
+leave. Each is paired with a stack that stands and matches. Needs numpy and torch alone; the simulator
+is handed in.
+
+Legend: P pairs, N blocks at most, n samples a scene.
+"""
+
+from __future__ import annotations
+
+import os
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stackgen.data.arrays import PADDING, StackArrays
+from stackgen.geometry import PAPER_GRID, Grid, silhouette_iou
+from stackgen.protocols import StabilityChecker, StackSampler, Verdict, check_all
+from stackgen.stack import PAPER_CATALOGUE, Catalogue, StackgenError
+
+_SCENES_AT_ONCE = 128
+
+
+@dataclass(frozen=True)
+class Preferences:
+    """P pairs; a pair's two stacks have the same blocks in the same order, and one silhouette.
+
+    Args:
+        better: Stand and match.
+        worse: Fall, or do not match.
+
+    Raises:
+        StackgenError: If they do not belong together.
+    """
+
+    better: StackArrays
+    worse: StackArrays
+
+    def __post_init__(self) -> None:
+        if len(self) == 0 or not np.array_equal(self.better.shapes, self.worse.shapes):
+            raise StackgenError("preferences: there must be pairs, each of two stacks of the same blocks")
+
+    def __len__(self) -> int:
+        return len(self.better)
+
+    def save(self, path: Path) -> None:
+        """Write as `.npz`.
+
+        Raises:
+            StackgenError: If it cannot be written.
+        """
+        if path.suffix != ".npz":
+            raise StackgenError(f"preferences are written to a .npz file, not {path.name}")
+        temporary = path.with_name(f".{path.stem}.{os.getpid()}.npz")
+        parts = {name: getattr(self.better, name) for name in ("shapes", "silhouettes", "template")}
+        sizes = {"num_shapes": np.array(self.better.num_shapes)}
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savez_compressed(
+                temporary, allow_pickle=False, better=self.better.poses, worse=self.worse.poses, **parts, **sizes
+            )
+            os.replace(temporary, path)
+        except OSError as error:
+            raise StackgenError(f"cannot write {path}: {error.strerror or error}") from error
+        finally:
+            temporary.unlink(missing_ok=True)
+
+    @staticmethod
+    def load(path: str | Path) -> Preferences:
+        """Inverse of :meth:`save`.
+
+        Raises:
+            StackgenError: If the file is missing, broken, or not such a file.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as file:
+                shapes, silhouettes, template = (file[name] for name in ("shapes", "silhouettes", "template"))
+                number = int(file["num_shapes"])
+                better, worse = (
+                    StackArrays(shapes, file[name], silhouettes, template, number) for name in ("better", "worse")
+                )
+        except FileNotFoundError as error:
+            raise StackgenError(f"no preferences at {path}: make them with `stackgen prefer`") from error
+        except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+            raise StackgenError(f"{path} is not a file of preferences: make one with `stackgen prefer`") from error
+        return Preferences(better, worse)
+
+
+def prefer(
+    sampler: StackSampler,
+    checker: StabilityChecker,
+    stacks: StackArrays,
+    num_samples: int = 3,
+    seed: int = 0,
+    iou: float = 0.95,
+    catalogue: Catalogue = PAPER_CATALOGUE,
+    grid: Grid = PAPER_GRID,
+    progress: Callable[[int], None] = lambda scenes: None,
+) -> Preferences:
+    """Sample for the silhouettes and block lists of some stacks, judge, and pair each failure with a success.
+
+    The success is another sample of the same scene in about half of the pairs, where there is one: what the
+    sampler can do already; the true stack else, so that no way of standing is forgotten.
+
+    Args:
+        sampler: Whom to teach.
+        checker: The physics.
+        stacks: Of the training split.
+        num_samples: n.
+        seed: Same seed, same pairs.
+        iou: A success stands, and its settled front silhouette matches at least this well.
+        catalogue, grid: Of the stacks.
+        progress: Told the number of scenes done.
+
+    Raises:
+        StackgenError: If no sample failed.
+    """
+    rng = np.random.default_rng(seed)
+    order = np.argsort(stacks.lengths, kind="stable")  # equal numbers of blocks together: no padding is computed
+    rows: list[int] = []
+    better: list[NDArray[np.float64]] = []
+    worse: list[NDArray[np.float64]] = []
+    for start in range(0, len(order), _SCENES_AT_ONCE):
+        part = order[start : start + _SCENES_AT_ONCE]
+        targets = stacks.images(part)
+        samples = sampler.sample_batch(targets, stacks.counts[part], num_samples, seed * 1_000_003 + start)
+        verdicts = iter(check_all(checker, [stack for drawn in samples for stack in drawn]))
+        for row, target, drawn in zip(part.tolist(), targets, samples, strict=True):
+            good = [_succeeds(next(verdicts), target, iou, grid) for _ in drawn]
+            winners = [stack.poses for stack, ok in zip(drawn, good, strict=True) if ok]
+            for stack in (stack for stack, ok in zip(drawn, good, strict=True) if not ok):
+                own = bool(winners) and rng.random() < 0.5
+                rows.append(row)
+                better.append(winners[rng.integers(len(winners))] if own else _truth(stacks, row))
+                worse.append(stack.poses)
+        progress(min(start + _SCENES_AT_ONCE, len(order)))
+    if not rows:
+        raise StackgenError("prefer: every sample stands and matches, so there is nothing to learn from them")
+    scenes = stacks.select(np.array(rows))
+    shapes = np.sort(scenes.shapes, axis=1)  # as samplers have them; padding is the largest number
+    pair = [
+        StackArrays(shapes, _padded(poses, shapes), scenes.silhouettes, scenes.template, stacks.num_shapes)
+        for poses in (better, worse)
+    ]
+    return Preferences(*pair)
+
+
+def _succeeds(verdict: Verdict, target: NDArray[np.bool_], iou: float, grid: Grid) -> bool:
+    return verdict.stable and silhouette_iou(verdict.settled, target, grid=grid) >= iou
+
+
+def _truth(stacks: StackArrays, row: int) -> NDArray[np.float64]:
+    """(k, 6) poses of a stack, its blocks sorted by shape."""
+    length = stacks.lengths[row]
+    order = np.argsort(stacks.shapes[row, :length], kind="stable")
+    return stacks.poses[row, order].astype(np.float64)
+
+
+def _padded(poses: list[NDArray[np.float64]], shapes: NDArray[np.uint8]) -> NDArray[np.float32]:
+    out = np.zeros((*shapes.shape, 6), np.float32)
+    for row, found in zip(out, poses, strict=True):
+        row[: len(found)] = found
+    assert ((shapes != PADDING).sum(axis=1) == [len(found) for found in poses]).all()
+    return out

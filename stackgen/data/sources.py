@@ -1,0 +1,160 @@
+"""Where a dataset lies: in a folder, behind a URL, or behind a command that prints a file.
+
+- a local path;
+- a URL that fsspec knows, `s3://bucket/data/paper` or `https://host/data/paper`, below which the files
+  have the names they have in a folder;
+- `pipe:COMMAND`, a shell command whose output is the file; `{file}` in it stands for a file's name,
+  as in `pipe:ssh host cat data/paper/{file}`.
+
+The manifest is the file `dataset.json` there, the shards are those it names.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+from stackgen.data.shards import Manifest, Split
+from stackgen.stack import StackgenError
+
+PIPE = "pipe:"
+PLACE_OF_FILE = "{file}"
+WAITS = (0.2, 1.0)
+"""Before what could not be fetched from afar is asked for again [s]."""
+
+_PLAIN_NAME = re.compile(r"\w[\w.-]*")  # nothing that a shell, a URL or a path would read as more than a name
+
+
+def is_remote(path: str | Path) -> bool:
+    """Whether a path is a URL or a pipe.
+
+    >>> is_remote("data/paper"), is_remote("s3://bucket/data"), is_remote("pipe:cat data/{file}")
+    (False, True, True)
+    """
+    return str(path).startswith(PIPE) or "://" in str(path)
+
+
+def is_folder(path: str | Path) -> bool:
+    """Whether a path stands for a manifest and shards; otherwise for one compact file.
+
+    >>> is_folder("https://host/data"), is_folder("https://host/data.npz"), is_folder("pipe:cat data.npz")
+    (True, False, False)
+    """
+    if not is_remote(path):
+        return Path(path).is_dir()
+    return PLACE_OF_FILE in str(path) if str(path).startswith(PIPE) else not str(path).endswith(".npz")
+
+
+def locate(root: str | Path, name: str) -> str:
+    """Where a file of the dataset at `root` lies.
+
+    Raises:
+        StackgenError: If `name` is not the plain name of a file.
+
+    >>> locate("s3://bucket/data/", "train-000001.tar"), locate("pipe:ssh host cat {file}", "dataset.json")
+    ('s3://bucket/data/train-000001.tar', 'pipe:ssh host cat dataset.json')
+    """
+    if not _PLAIN_NAME.fullmatch(name):
+        raise StackgenError(f"dataset {root}: its manifest names a file {name!r}, which is not a plain file name")
+    if str(root).startswith(PIPE):
+        return str(root).replace(PLACE_OF_FILE, name)
+    return f"{str(root).rstrip('/')}/{name}" if is_remote(root) else str(Path(root) / name)
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """A whole file from wherever it lies.
+
+    Raises:
+        StackgenError: If it cannot be read; one line.
+    """
+    try:
+        if str(path).startswith(PIPE):
+            return _output(str(path).removeprefix(PIPE))
+        return _fetch(str(path)) if is_remote(path) else Path(path).read_bytes()
+    except FileNotFoundError as error:
+        raise StackgenError(f"there is no file {path}") from error
+    except StackgenError:
+        raise
+    except Exception as error:  # every file system of fsspec has errors of its own
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split()) or type(error).__name__
+        raise StackgenError(f"{path} cannot be read: {reason}") from error
+
+
+def load_manifest(root: str | Path) -> Manifest:
+    """The manifest of a dataset, wherever it lies.
+
+    Raises:
+        StackgenError: If there is none, or it is not one of ours.
+    """
+    if not is_remote(root):
+        return Manifest.load(root)
+    where = locate(root, "dataset.json")
+    return Manifest.parse(read_bytes(where), where)
+
+
+class Shard:
+    """One shard of a dataset, wherever that lies.
+
+    Args:
+        root: Of the dataset.
+        entry: What the manifest says of it.
+
+    Raises:
+        StackgenError: If the manifest's entry is not complete.
+    """
+
+    def __init__(self, root: str | Path, entry: dict[str, Any]) -> None:
+        try:
+            self.name, self.sha256, self.samples = str(entry["file"]), str(entry["sha256"]), int(entry["samples"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise StackgenError(f"dataset {root}: dataset.json is damaged: shard {entry!r:.80}") from error
+        self.path = locate(root, self.name)
+
+    def read(self) -> bytes:
+        """Its bytes, if they are those that were written; from afar they are asked for up to three times.
+
+        Raises:
+            StackgenError: If it is missing, cut short or altered; the message names it.
+        """
+        for wait in WAITS if is_remote(self.path) else ():
+            try:
+                return self._read_once()
+            except StackgenError:
+                time.sleep(wait)
+        return self._read_once()
+
+    def _read_once(self) -> bytes:
+        try:
+            content = read_bytes(self.path)
+        except StackgenError as error:
+            raise StackgenError(f"shard {self.name} is missing or damaged: {error}") from error
+        if hashlib.sha256(content).hexdigest() != self.sha256:
+            cure = "fetch it again" if is_remote(self.path) else "`stackgen dataset repair` makes it again"
+            why = "cut short or altered, its checksum is not the one in dataset.json"
+            raise StackgenError(f"shard {self.path} is damaged: {why}; {cure}")
+        return content
+
+
+def shards_of(manifest: Manifest, root: str | Path, split: Split) -> list[Shard]:
+    """The shards of a split, in order."""
+    return [Shard(root, entry) for entry in manifest.shards if entry["split"] == split]
+
+
+def _fetch(url: str) -> bytes:
+    import fsspec  # type: ignore[import-untyped]  # only where something lies elsewhere
+
+    # A file system for every call: those that talk over a network do not survive a fork.
+    files, path = fsspec.url_to_fs(url)
+    return files.cat_file(path)
+
+
+def _output(command: str) -> bytes:
+    done = subprocess.run(command, shell=True, stdin=subprocess.DEVNULL, capture_output=True, check=False)
+    if done.returncode:
+        complaint = (done.stderr.decode(errors="replace").strip().splitlines() or ["it printed no error"])[-1]
+        raise StackgenError(f"`{command}` ended with {done.returncode}: {complaint}")
+    return done.stdout
