@@ -21,6 +21,10 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
+from stackgen.baselines import HEURISTICS
+from stackgen.baselines.regression import PoseRegression
+from stackgen.baselines.transformer import RegressionConfig, TransformerSampler
+from stackgen.baselines.vae import PoseVAE, VAEConfig
 from stackgen.files import write_atomically
 from stackgen.geometry import Grid
 from stackgen.models.blocklist import BlockListNetwork, CNNConfig, CNNPredictor
@@ -45,11 +49,13 @@ _DAMAGED = (
 
 
 def load_sampler(weights: str | Path = "default") -> StackSampler:
-    """The sampler that a name, a `.safetensors` file or a `.ckpt` of ours stands for.
+    """The sampler that a name (of weights or of a heuristic), a `.safetensors` file or a `.ckpt` of ours stands for.
 
     Raises:
         StackgenError: If there is no such thing, or it holds something else.
     """
+    if str(weights) in HEURISTICS:
+        return HEURISTICS[str(weights)]()
     tensors, card = read_weights(weights, "sampler")
     return _build(weights, card, tensors, _SAMPLERS, "sampler")
 
@@ -105,7 +111,8 @@ def resolve(weights: str | Path, role: str = "sampler") -> Path:
     shipped = FOLDER / f"{weights}.safetensors"
     if path.name == str(weights) and shipped.is_file():
         return shipped
-    names = ", ".join(sorted(p.stem for p in FOLDER.glob("*.safetensors"))) or "none are shipped"
+    shipped_names = [p.stem for p in FOLDER.glob("*.safetensors")]
+    names = ", ".join(sorted([*shipped_names, *(HEURISTICS if role == "sampler" else ())])) or "none are shipped"
     raise StackgenError(f"no weights called {weights}: give a .safetensors or .ckpt file, or a name ({names})")
 
 
@@ -191,9 +198,20 @@ def _diffusion(config: dict[str, Any], catalogue: Catalogue, grid: Grid, max_blo
     return network, DiffusionSampler
 
 
+def _regression(config: dict[str, Any], catalogue: Catalogue, grid: Grid, max_blocks: int) -> tuple[nn.Module, Any]:
+    parts = DenoiserConfig(**config["transformer"]), RegressionConfig(**config["regression"])
+    return PoseRegression(*parts, len(catalogue), grid.image_size, max_blocks), TransformerSampler
+
+
+def _vae(config: dict[str, Any], catalogue: Catalogue, grid: Grid, max_blocks: int) -> tuple[nn.Module, Any]:
+    parts = DenoiserConfig(**config["transformer"]), RegressionConfig(**config["regression"])
+    vae = VAEConfig(**config["vae"])
+    return PoseVAE(*parts, vae, len(catalogue), grid.image_size, max_blocks), TransformerSampler
+
+
 def _cnn(config: dict[str, Any], catalogue: Catalogue, grid: Grid, max_blocks: int) -> tuple[nn.Module, Any]:
-    return BlockListNetwork(CNNConfig(**config["cnn"]), len(catalogue), max_blocks), CNNPredictor
+    return BlockListNetwork(CNNConfig(**config["cnn"]), catalogue, max_blocks, grid), CNNPredictor
 
 
-_SAMPLERS: dict[str, Maker] = {"ddpm": _diffusion}
+_SAMPLERS: dict[str, Maker] = {"ddpm": _diffusion, "tran-reg": _regression, "tran-vae": _vae}
 _PREDICTORS: dict[str, Maker] = {"blocklist": _cnn}

@@ -1,0 +1,11 @@
+"""What the diffusion model is compared with: heuristics, found by name, and learned baselines."""
+
+from __future__ import annotations
+
+from stackgen.baselines.brute_force import BruteForce
+from stackgen.baselines.greedy_random import GreedyRandom
+from stackgen.baselines.heuristic import Heuristic
+from stackgen.baselines.random_placement import RandomPlacement
+
+HEURISTICS: dict[str, type[Heuristic]] = {kind.kind: kind for kind in (BruteForce, GreedyRandom, RandomPlacement)}
+"""By the name that stands for them where weights are asked for; there they have their default settings."""

@@ -1,0 +1,115 @@
+"""Greedy-Random (paper, "Greedy-Random Baseline"): fill the silhouette from the ground up with the longest blocks.
+
+Legend: H x W pixels, S shapes. A run is (left, right), the ends of a row of pixels without a gap [cell].
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stackgen.baselines.heuristic import Heuristic, section
+from stackgen.baselines.swap import swap
+from stackgen.geometry import PAPER_GRID, Grid, Mask
+from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Stack, StackgenError, shapes_of
+
+Run = tuple[float, float]
+
+
+class GreedyRandom(Heuristic):
+    """Layer by layer from the ground up: the longest block that fits the longest run of pixels, at its left end.
+
+    Runs are measured at half the layer's height, and so are blocks: a triangle is half a cell wide
+    there, so it goes where nothing longer does. What is left of a run after a block is a run again.
+    Blocks that fit nowhere are laid on the ground beside the structure.
+
+    Args:
+        sigma: Probability of the swap.
+        tolerance: How much a block may be wider than its run [cell]; a run that is left over by no
+            more is filled, and its block stands in its middle.
+        catalogue, grid, max_blocks: See Heuristic.
+    """
+
+    kind = "greedy-random"
+
+    def __init__(
+        self,
+        sigma: float = 0.6,
+        tolerance: float = 0.24,
+        catalogue: Catalogue = PAPER_CATALOGUE,
+        grid: Grid = PAPER_GRID,
+        max_blocks: int = MAX_BLOCKS,
+    ) -> None:
+        super().__init__(catalogue, grid, max_blocks)
+        if not 0 <= sigma <= 1 or not 0 <= tolerance < 0.5:
+            raise StackgenError("greedy: sigma must lie in 0..1 and tolerance in 0..0.5")
+        self.sigma, self.tolerance = sigma, tolerance
+        self._sections = [section(shape) for shape in catalogue]
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Its numbers."""
+        return {"sigma": self.sigma, "tolerance": self.tolerance}
+
+    def place(self, silhouette: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
+        """Fill the silhouette, perhaps swap, and lay down what is left."""
+        structure, left = self.fill(silhouette, counts)
+        return self._with_the_rest(swap(structure, self.sigma, rng), left)
+
+    def fill(self, silhouette: Mask, counts: NDArray[np.int64]) -> tuple[Stack, NDArray[np.int64]]:
+        """The structure, and the block list (S,) of what fits nowhere."""
+        left = counts.copy()
+        shapes: list[int] = []
+        poses: list[list[float]] = []
+        for level in range(self.grid.height):
+            runs = layer_runs(silhouette, level, self.grid)
+            while runs:
+                run = max(runs, key=lambda r: r[1] - r[0])  # the leftmost of equal ones
+                runs.remove(run)
+                shape = self._longest(left, run)
+                if shape is None:
+                    continue
+                x, rest = self._lay(shape, run)
+                shapes.append(shape)
+                poses.append([x, 0, level + 0.5, 0, 0, 0])
+                left[shape] -= 1
+                runs = sorted([*runs, rest]) if rest else runs
+        return Stack(np.array(shapes, dtype=np.int64), np.array(poses).reshape(-1, 6), self.catalogue), left
+
+    def _longest(self, left: NDArray[np.int64], run: Run) -> int | None:
+        """The longest block that is left and fits."""
+        fitting = [s for s, w in enumerate(self._sections) if left[s] and w <= run[1] - run[0] + self.tolerance]
+        return max(fitting, key=lambda s: self._sections[s], default=None)
+
+    def _lay(self, shape: int, run: Run) -> tuple[float, Run | None]:
+        """Where a block stands in a run, and what it leaves of it."""
+        begin, end = run
+        if end - begin - self._sections[shape] <= self.tolerance:
+            return (begin + end) / 2, None
+        width = self.catalogue[shape].size[0]
+        return begin + width / 2, (begin + width, end) if begin + width < end else None
+
+    def _with_the_rest(self, structure: Stack, left: NDArray[np.int64]) -> Stack:
+        """The structure, and the blocks that are left on the ground to its right, half a cell between all of them."""
+        shapes, poses = list(structure.shapes), list(structure.poses)
+        edge = self.grid.width / 2
+        for shape in shapes_of(left).tolist():
+            width = self.catalogue[shape].size[0]
+            shapes.append(shape)
+            poses.append(np.array([edge + 0.5 + width / 2, 0, 0.5, 0, 0, 0]))
+            edge += 0.5 + width
+        return Stack(np.array(shapes), np.array(poses), self.catalogue)
+
+
+def layer_runs(silhouette: Mask, level: int, grid: Grid) -> list[Run]:
+    """The runs of pixels at half the height of a layer, from left to right.
+
+    >>> layer_runs(np.pad(np.ones((14, 28), bool), ((46, 4), (18, 18))), 0, PAPER_GRID)
+    [(-1.0, 1.0)]
+    """
+    row = int(np.argmin(np.abs(grid.vertical("front") - level - 0.5)))
+    filled = np.concatenate([[False], silhouette[row], [False]])
+    edges = (np.flatnonzero(filled[1:] != filled[:-1]) - grid.image_size / 2) / grid.pixels_per_cell
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

@@ -1,0 +1,102 @@
+"""What the heuristics share: one stack at a time, each from a random stream of its own.
+
+Legend: B scenes, S shapes, H x W pixels.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stackgen.geometry import PAPER_GRID, Grid, Mask, row_intervals
+from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Shape, Stack, StackgenError, check_block_list
+
+
+class Heuristic(ABC):
+    """A StackSampler that places blocks by rules; every block of the list gets a pose.
+
+    A stack depends on the seed, the silhouette, the block list and its number among the samples, and
+    on nothing else: not on the other scenes of the batch, and not on how many samples are drawn.
+
+    Args:
+        catalogue: What the counts mean.
+        grid: Scale of the silhouettes.
+        max_blocks: The longest block list it takes.
+    """
+
+    kind: str
+    """Its name on the command line."""
+
+    def __init__(
+        self, catalogue: Catalogue = PAPER_CATALOGUE, grid: Grid = PAPER_GRID, max_blocks: int = MAX_BLOCKS
+    ) -> None:
+        self.catalogue, self.grid, self.max_blocks = catalogue, grid, max_blocks
+
+    @abstractmethod
+    def place(self, silhouette: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
+        """One stack for a silhouette (H, W) and a block list (S,)."""
+
+    @property
+    @abstractmethod
+    def settings(self) -> dict[str, Any]:
+        """Its numbers, as JSON allows."""
+
+    @property
+    def card(self) -> dict[str, Any]:
+        """What is known about it, like the card of weights; the checksum is that of kind and settings."""
+        content = {"kind": self.kind, "config": self.settings}
+        digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+        return {**content, "name": self.kind, "sha256": digest}
+
+    def sample_batch(
+        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
+    ) -> list[list[Stack]]:
+        """See StackSampler.
+
+        Raises:
+            StackgenError: If a block list is empty or too long or has a shape that is not one cell high,
+                or sizes differ.
+        """
+        if num_samples < 1:
+            raise StackgenError(f"the number of samples must be at least 1, got {num_samples}")
+        size, shapes = self.grid.image_size, len(self.catalogue)
+        if silhouettes.ndim != 3 or silhouettes.shape[1:] != (size, size):
+            raise StackgenError(f"sampling needs silhouettes (B, {size}, {size}), got {silhouettes.shape}")
+        if np.shape(counts) != (len(silhouettes), shapes):
+            raise StackgenError(f"sampling needs a block list (S = {shapes}) for each silhouette")
+        for shape, used in zip(self.catalogue, np.any(counts, axis=0), strict=True):
+            if used and abs(shape.size[2] - 1) > 1e-6:
+                raise StackgenError(f"{self.kind} places shapes one cell high, not {shape.name!r}")
+        scenes = []
+        for picture, list_ in zip(np.asarray(silhouettes, dtype=bool), np.asarray(counts), strict=True):
+            check_block_list(list_, self.max_blocks)
+            streams = (random_stream(seed, picture, list_, number) for number in range(num_samples))
+            scenes.append([self.place(picture, list_, rng) for rng in streams])
+        return scenes
+
+    def _largest_first(self, counts: NDArray[np.int64]) -> list[int]:
+        """Shape index of each block, the ones of most area first."""
+        order = sorted(range(len(counts)), key=lambda s: (-self.catalogue[s].volume, s))
+        return [s for s in order for _ in range(int(counts[s]))]
+
+
+def random_stream(seed: int, silhouette: Mask, counts: NDArray[np.int64], number: int) -> np.random.Generator:
+    """The random numbers of one sample of one scene."""
+    content = np.packbits(silhouette).tobytes() + np.asarray(counts, dtype="<i8").tobytes()
+    scene = int.from_bytes(hashlib.sha256(content).digest()[:16], "little")
+    return np.random.default_rng([seed, scene, number])
+
+
+def section(shape: Shape) -> float:
+    """Width of an upright block at half its height [cell].
+
+    >>> section(PAPER_CATALOGUE[3])  # the triangle
+    0.5
+    """
+    left, right = row_intervals(np.asarray(shape.outline), np.zeros(1))
+    return float(right[0] - left[0])

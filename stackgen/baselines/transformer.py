@@ -1,0 +1,317 @@
+"""What the learned baselines share: the denoiser's Transformer without noise, and poses as a regression target.
+
+Where the denoiser tells equal blocks apart by their noisy poses, here "positional encodings [are]
+added to the shape embeddings" (paper, "Transformer-VAE Baseline"): every block has a place in a list.
+The list is shuffled for each stack in training and for each sample afterwards (SPEC: how the
+deterministic methods get three samples).
+
+Legend: B scenes, N block tokens, C silhouette tokens, d width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from stackgen.geometry import PAPER_GRID, Grid, Mask
+from stackgen.models.denoiser import (
+    POSE,
+    CrossLayer,
+    DenoiserConfig,
+    EncoderLayer,
+    Patches,
+    ranks,
+    raster_order,
+    sinusoids,
+)
+from stackgen.models.diffusion import pad_shapes
+from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Stack, StackgenError
+
+_FORBIDDEN = 1e6  # cost of giving a block another shape's pose
+
+
+@dataclass(frozen=True)
+class RegressionConfig:
+    """How estimated poses are compared with the true ones. The paper gives none of these; they are ours.
+
+    Args:
+        assignment: Which of several equal blocks' poses is whose target: `raster`, by their order
+            from the bottom up and left to right; or `matched`, as fits the estimate best.
+        loss: `squared`, whose best answer is the mean of the possible poses, or `absolute`, their median.
+        least_std: Lower bound of the standard deviation that a dimension is divided by [cell, rad].
+    """
+
+    assignment: Literal["raster", "matched"] = "raster"
+    loss: Literal["squared", "absolute"] = "squared"
+    least_std: float = 0.0
+
+
+class BlockTokens(nn.Module):
+    """Shapes to tokens: codebook entry plus positional encoding, and the rank among equal blocks if `ordered`."""
+
+    positions: Tensor
+
+    def __init__(self, config: DenoiserConfig, num_shapes: int, max_blocks: int) -> None:
+        super().__init__()
+        self.shape_embedding = nn.Embedding(num_shapes, config.width)
+        self.rank_embedding = nn.Embedding(max_blocks, config.width) if config.ordered else None
+        self.register_buffer("positions", sinusoids(torch.arange(max_blocks).float(), config.width), persistent=False)
+
+    def forward(self, shapes: Tensor) -> Tensor:
+        """(B, N) indices, negative at padding, to (B, N, d)."""
+        tokens = self.shape_embedding(shapes.clamp(min=0)) + self.positions[: shapes.shape[1]]
+        return tokens if self.rank_embedding is None else tokens + self.rank_embedding(ranks(shapes))
+
+
+class SilhouetteTokens(nn.Module):
+    """Silhouette to tokens, as the denoiser makes them: patches, and in `cross` a short encoder over them."""
+
+    def __init__(self, config: DenoiserConfig, image_size: int) -> None:
+        super().__init__()
+        self.patches = Patches(config.patch, config.stride, image_size, config.width)
+        layers = config.memory_layers if config.conditioning == "cross" else 0
+        self.layers = nn.ModuleList(EncoderLayer(config, norm_first=True) for _ in range(layers))
+
+    def forward(self, silhouette: Tensor) -> Tensor:
+        """(B, H, W) in {0, 1} to (B, C, d)."""
+        tokens = self.patches(silhouette)
+        for layer in self.layers:
+            tokens = layer(tokens, None)
+        return tokens
+
+
+class Trunk(nn.Module):
+    """The denoiser's layers: block tokens that see each other and the silhouette.
+
+    Args:
+        config: The denoiser's; `layers` does not count here.
+        layers: How many.
+        conditioned: Whether a vector takes the place of the denoiser's time. Otherwise nothing does, or
+            in `cross`, where it scales and shifts every layer, one that is learned.
+    """
+
+    def __init__(self, config: DenoiserConfig, layers: int, conditioned: bool) -> None:
+        super().__init__()
+        self.mask_padding = config.mask_padding
+        self.joint = config.conditioning == "joint"
+        if self.joint:
+            self.layers = nn.ModuleList(EncoderLayer(config) for _ in range(layers))
+        else:
+            self.layers = nn.ModuleList(CrossLayer(config) for _ in range(layers))
+            self.norm = nn.LayerNorm(config.width)
+            if not conditioned:
+                self.condition = nn.Parameter(torch.randn(config.width))
+
+    def forward(self, blocks: Tensor, mask: Tensor, memory: Tensor, condition: Tensor | None = None) -> Tensor:
+        """Tokens (B, N, d) for tokens (B, N, d); mask (B, N), condition (B, d).
+
+        Memory is (B, C, d), or (B / n, C, d), serving n consecutive rows each.
+        """
+        if self.joint:
+            if condition is not None:
+                blocks = blocks + condition[:, None]
+            memory = memory.repeat_interleave(len(blocks) // len(memory), 0)
+            tokens = torch.cat([blocks * mask[..., None], memory], dim=1)  # (B, N + C, d), zero vectors as padding
+            seen = F.pad(mask, (0, memory.shape[1]), value=True) if self.mask_padding else None
+            for layer in self.layers:
+                tokens = layer(tokens, seen)
+            return tokens[:, : blocks.shape[1]]
+        vector = self.condition.expand(len(blocks), -1) if condition is None else condition
+        seen = None if bool(mask.all()) else mask
+        for layer in self.layers:
+            blocks = layer(blocks, vector, seen, memory)
+        return self.norm(blocks)
+
+
+class PoseNetwork(nn.Module):
+    """What Tran-Reg and Tran-VAE have in common: normalisation, order of the blocks, error and sampling.
+
+    A subclass implements `draw`.
+
+    Args:
+        transformer: Architecture, described as the denoiser's.
+        regression: See RegressionConfig.
+        num_shapes: Size of the catalogue.
+        image_size: Edge of the silhouette [pixel].
+        max_blocks: N.
+
+    Raises:
+        StackgenError: If the architecture asks for what only a denoiser has.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        transformer: DenoiserConfig,
+        regression: RegressionConfig,
+        num_shapes: int = 4,
+        image_size: int = 64,
+        max_blocks: int = MAX_BLOCKS,
+    ) -> None:
+        super().__init__()
+        if transformer.self_conditioning:
+            raise StackgenError("self_conditioning: only a denoiser has an earlier estimate to look at")
+        self.transformer, self.regression = transformer, regression
+        self.blocks = BlockTokens(transformer, num_shapes, max_blocks)
+        self.silhouette = SilhouetteTokens(transformer, image_size)
+        self.head = nn.Linear(transformer.width, POSE)
+        if transformer.conditioning == "cross":
+            nn.init.zeros_(self.head.weight)
+            nn.init.zeros_(self.head.bias)
+        self.register_buffer("mean", torch.zeros(POSE))
+        self.register_buffer("std", torch.ones(POSE))
+
+    @property
+    def trims(self) -> bool:
+        """Whether padding may be left out: not where the network was trained to see it."""
+        return self.transformer.conditioning == "cross" or self.transformer.mask_padding
+
+    def fit_normalization(self, mean: ArrayLike, std: ArrayLike) -> None:
+        """Take over the training poses' statistics (6,) [cell, rad]."""
+        self.mean.copy_(torch.as_tensor(np.asarray(mean)))
+        self.std.copy_(torch.as_tensor(np.asarray(std)).clamp(min=max(self.regression.least_std, 1e-6)))
+
+    def scene(self, batch: dict[str, Tensor], generator: torch.Generator | None) -> tuple[Tensor, Tensor, Tensor]:
+        """Shapes (B, N), mask (B, N) and normalised poses (B, N, 6) of a batch, the shapes in random order.
+
+        The blocks of one shape keep their order from the bottom up and left to right.
+        """
+        order = raster_order(batch["poses"], batch["shapes"])
+        shapes = batch["shapes"].gather(1, order)
+        order = order.gather(1, shuffled(shapes, generator))
+        shapes, mask = batch["shapes"].gather(1, order), batch["mask"].gather(1, order)
+        poses = batch["poses"].gather(1, order[..., None].expand_as(batch["poses"]))
+        return shapes, mask, (poses - self.mean) / self.std
+
+    def error(self, estimate: Tensor, target: Tensor, shapes: Tensor, mask: Tensor) -> Tensor:
+        """(B,) error of normalised poses (B, N, 6), averaged over dimensions and real blocks."""
+        if self.regression.assignment == "matched":
+            match = best_match(self._distance(estimate[:, :, None], target[:, None]), shapes)
+            target = target.gather(1, match[..., None].expand_as(target))
+        return (self._distance(estimate, target) * mask).sum(-1) / mask.sum(-1)
+
+    def _distance(self, a: Tensor, b: Tensor) -> Tensor:
+        """Mean over the six dimensions."""
+        difference = a - b
+        return (difference.square() if self.regression.loss == "squared" else difference.abs()).mean(-1)
+
+    def draw(self, shapes: Tensor, mask: Tensor, memory: Tensor, generator: torch.Generator) -> Tensor:
+        """Normalised poses (B, N, 6)."""
+        raise NotImplementedError
+
+    @torch.inference_mode()
+    def sample(self, silhouettes: Tensor, shapes: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
+        """Poses (B, N, 6) [cell, rad] for silhouettes (B / n, H, W), each serving n rows of shapes (B, N)."""
+        keys = torch.rand(shapes.shape, generator=generator, device=generator.device).to(shapes.device)
+        order = (keys + 2 * ~mask).argsort(-1)  # padding stays last
+        poses = self.draw(shapes.gather(1, order), mask.gather(1, order), self.silhouette(silhouettes), generator)
+        poses = poses.gather(1, order.argsort(-1)[..., None].expand_as(poses))
+        return poses * self.std + self.mean
+
+
+def shuffled(shapes: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    """(B, N) random order of blocks that are sorted by shape; those of one shape stay in order, padding comes last.
+
+    Args:
+        shapes: (B, N) sorted, but for the padding at the end, which is negative.
+        generator: The global one by default.
+    """
+    device = generator.device if generator is not None else shapes.device
+    keys = torch.rand(shapes.shape, generator=generator, device=device).to(shapes.device)
+    kind = torch.where(shapes < 0, shapes.max() + 1, shapes).to(keys.dtype)
+    keys = (2 * kind + keys).sort(-1).values - 2 * kind  # ascending within each shape
+    return (keys + 2 * (shapes < 0)).argsort(-1)
+
+
+def best_match(cost: Tensor, shapes: Tensor) -> Tensor:
+    """(B, N) the target of each block: the permutation within equal shapes that costs least (Kuhn 1955).
+
+    Args:
+        cost: (B, N, N) of giving block i target j.
+        shapes: (B, N) of blocks and of targets.
+
+    >>> cost = torch.tensor([[[2.0, 1.0, 0.0], [1.0, 5.0, 0.0], [0.0, 0.0, 3.0]]])
+    >>> best_match(cost, torch.tensor([[0, 0, 1]])).tolist()
+    [[1, 0, 2]]
+    """
+    same = shapes[:, :, None] == shapes[:, None, :]
+    costs = torch.where(same, cost.detach(), _FORBIDDEN).double().cpu().numpy()
+    found = np.stack([linear_sum_assignment(matrix)[1] for matrix in costs])
+    return torch.from_numpy(found).to(shapes.device)
+
+
+class TransformerSampler:
+    """A StackSampler: a learned baseline with its world.
+
+    Args:
+        model: Trained.
+        catalogue, grid, max_blocks: The world it was trained in.
+        card: What is known about the weights.
+        batch: Stacks estimated together, at most.
+    """
+
+    def __init__(
+        self,
+        model: PoseNetwork,
+        catalogue: Catalogue = PAPER_CATALOGUE,
+        grid: Grid = PAPER_GRID,
+        max_blocks: int = MAX_BLOCKS,
+        card: dict[str, Any] | None = None,
+        batch: int = 512,
+    ) -> None:
+        self.model = model.eval()
+        self.catalogue, self.grid, self.max_blocks = catalogue, grid, max_blocks
+        self.card = card or {}
+        self.batch = batch
+
+    def sample_batch(
+        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
+    ) -> list[list[Stack]]:
+        """See StackSampler.
+
+        Raises:
+            StackgenError: If a block list is empty or longer than the model takes, or sizes differ.
+        """
+        self._check(silhouettes, counts, num_samples)
+        stacks: list[list[Stack]] = []
+        scenes = max(1, self.batch // num_samples)
+        generator = torch.Generator().manual_seed(seed)
+        for start in range(0, len(counts), scenes):
+            part = slice(start, start + scenes)
+            stacks += self._sample(silhouettes[part], np.asarray(counts[part]), num_samples, generator)
+        return stacks
+
+    def _check(self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int) -> None:
+        if num_samples < 1:
+            raise StackgenError(f"the number of samples must be at least 1, got {num_samples}")
+        size = self.grid.image_size
+        if silhouettes.ndim != 3 or silhouettes.shape[1:] != (size, size) or len(counts) != len(silhouettes):
+            raise StackgenError(f"sampling needs silhouettes (B, {size}, {size}) and as many block lists")
+        totals = np.asarray(counts).sum(axis=1)
+        if len(totals) and not (totals.min() >= 1 and totals.max() <= self.max_blocks):
+            raise StackgenError(f"this model takes 1 to {self.max_blocks} blocks, got {sorted(set(totals.tolist()))}")
+
+    def _sample(
+        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, generator: torch.Generator
+    ) -> list[list[Stack]]:
+        device = self.model.mean.device
+        longest = int(counts.sum(axis=1).max()) if self.model.trims else self.max_blocks
+        shapes, mask = pad_shapes(counts, longest)
+        poses = self.model.sample(
+            torch.from_numpy(np.ascontiguousarray(silhouettes, dtype=np.float32)).to(device),
+            torch.from_numpy(np.repeat(shapes, num_samples, axis=0)).to(device),
+            torch.from_numpy(np.repeat(mask, num_samples, axis=0)).to(device),
+            generator,
+        )
+        found = poses.double().cpu().numpy().reshape(len(shapes), num_samples, -1, POSE)
+        kinds = [row[real] for row, real in zip(shapes, mask, strict=True)]
+        return [[Stack(k, p[: len(k)], self.catalogue) for p in rows] for k, rows in zip(kinds, found, strict=True)]
