@@ -8,9 +8,11 @@ Legend: B scenes in a batch, n samples a scene, S shapes, H x W pixels.
 
 from __future__ import annotations
 
+import signal
+import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -22,8 +24,8 @@ from numpy.typing import NDArray
 from stackgen._lightning import pl
 from stackgen.data.arrays import Batch, StackArrays, load_dataset
 from stackgen.geometry import PAPER_GRID, Grid, Mask, View, silhouette
-from stackgen.metrics import SceneScore, can_make, list_rank, scene_metrics, score_sample
-from stackgen.protocols import BlockListPredictor, StabilityChecker, StackSampler, Verdict
+from stackgen.metrics import SceneScore, can_make, has_plain_rows, list_rank, scene_metrics, score_sample
+from stackgen.protocols import BlockListPredictor, StabilityChecker, StackSampler, Verdict, check_all
 from stackgen.results import PREDICTED_LIST, TOP, TRUE_LIST, Evaluation, SceneResult
 from stackgen.stack import PAPER_CATALOGUE, Catalogue, Stack, StackgenError
 
@@ -142,8 +144,10 @@ def evaluate_batch(
         ranked = predictor.predict(silhouettes, top=TOP)
         ranks = list(list_rank(ranked, counts).tolist())
         counts = ranked[:, 0]
+    began = time.perf_counter()
     stacks = sampler.sample_batch(silhouettes, counts, num_samples, seed)
-    return judge(scenes, stacks, checker, grid, counts, ranks)
+    seconds = (time.perf_counter() - began) / (num_samples * len(scenes))
+    return [replace(found, seconds=seconds) for found in judge(scenes, stacks, checker, grid, counts, ranks)]
 
 
 def judge(
@@ -172,11 +176,12 @@ def judge(
         rank = ranks[i] if ranks else None
         score = SceneScore(tuple(score_sample(s, v, targets, grid) for s, v in zip(samples, judged, strict=True)))
         feasible = None
-        if rank is not None:
+        if rank is not None and has_plain_rows(samples[0].catalogue):
             feasible = can_make(scene.silhouette, asked, samples[0].catalogue, grid)
         fell = tuple(tuple(int(b) for b in np.flatnonzero(v.fell)) for v in judged)
         drop = tuple(float(np.max(v.drop, initial=0.0)) for v in judged)
-        results.append(SceneResult(scene.name, tuple(int(c) for c in asked), score, fell, drop, rank, feasible))
+        asked_list = tuple(int(c) for c in asked)
+        results.append(SceneResult(scene.name, asked_list, score, fell, drop, rank, feasible, stacks=tuple(samples)))
     return results
 
 
@@ -205,17 +210,12 @@ def physics_of(checker: StabilityChecker) -> dict[str, Any] | None:
     return physics.to_json() if physics is not None else None
 
 
-def check_all(checker: StabilityChecker, stacks: Sequence[Stack]) -> list[Verdict]:
-    """Judge many stacks; at once where the checker can."""
-    many = getattr(checker, "check_all", None)
-    return many(stacks) if many else [checker.check(stack) for stack in stacks]
-
-
 _worker_checker: StabilityChecker | None = None
 
 
 def _start_worker(factory: Callable[[], StabilityChecker]) -> None:
     global _worker_checker
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for who started the processes
     _worker_checker = factory()
 
 

@@ -294,16 +294,29 @@ def can_make(
         StackgenError: If a shape of the list is not one cell high.
     """
     wanted = tuple(int(c) for c in np.asarray(counts))
-    sections = tuple(_section(shape) if c else (np.inf, True) for shape, c in zip(catalogue, wanted, strict=True))
-    used = {(0,) * len(wanted)}
-    for width in _runs(np.asarray(silhouette, dtype=bool), grid):
-        fillings = _fillings(width, sections)
+    return wanted in lists_that_make(silhouette, wanted, catalogue, grid)
+
+
+def lists_that_make(
+    silhouette: ArrayLike, limit: ArrayLike, catalogue: Catalogue = PAPER_CATALOGUE, grid: Grid = PAPER_GRID
+) -> set[tuple[int, ...]]:
+    """All block lists of at most `limit` (S,) of each shape that can make a silhouette; see :func:`can_make`."""
+    most = tuple(int(c) for c in np.asarray(limit))
+    sections = tuple(cross_section(shape) if c else (np.inf, True) for shape, c in zip(catalogue, most, strict=True))
+    used = {(0,) * len(most)}
+    for left, right in (run for row in row_runs(np.asarray(silhouette, dtype=bool), grid) for run in row):
+        fillings = _fillings(round(right - left, 9), sections)
         sums = {tuple(a + b for a, b in zip(u, f, strict=True)) for u in used for f in fillings}
-        used = {s for s in sums if all(a <= b for a, b in zip(s, wanted, strict=True))}
-    return wanted in used and any(wanted)
+        used = {s for s in sums if all(a <= b for a, b in zip(s, most, strict=True))}
+    return {s for s in used if any(s)}
 
 
-def _section(shape: Shape) -> tuple[float, bool]:
+def has_plain_rows(catalogue: Catalogue) -> bool:
+    """Whether all shapes are one cell high, so that :func:`can_make` can answer."""
+    return all(abs(shape.size[2] - 1) < 1e-6 for shape in catalogue)
+
+
+def cross_section(shape: Shape) -> tuple[float, bool]:
     """Width at half height [cell], and whether the shape is narrower there than its box."""
     width, _, height = shape.size
     if abs(height - 1) > 1e-6:
@@ -316,16 +329,19 @@ def _section(shape: Shape) -> tuple[float, bool]:
     return float(np.ptp(x)), bool(np.ptp(x) < width - 1e-6)
 
 
-def _runs(silhouette: Mask, grid: Grid) -> list[float]:
-    """Widths [cell] of the runs of pixels at half height of each row of cells."""
-    z = grid.vertical("front")
-    widths: list[float] = []
+def row_runs(silhouette: Mask, grid: Grid = PAPER_GRID) -> list[list[tuple[float, float]]]:
+    """For each row of cells, from the ground up, the runs of pixels at half height: their ends in x [cell]."""
+    z, x = grid.vertical("front"), grid.horizontal()
+    half = 0.5 / grid.pixels_per_cell
+    rows = []
     for level in range(grid.height):
         band = silhouette[np.abs(z - level - 0.5) < 0.15]
         filled = np.concatenate([[False], 2 * band.sum(axis=0) >= len(band), [False]])
         edges = np.flatnonzero(filled[1:] != filled[:-1])
-        widths += ((edges[1::2] - edges[::2]) / grid.pixels_per_cell).tolist()
-    return widths
+        rows.append(
+            [(float(x[a] - half), float(x[b - 1] + half)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        )
+    return rows
 
 
 @lru_cache(maxsize=4096)

@@ -15,8 +15,9 @@ from rich.box import SIMPLE
 from rich.table import Table
 
 from stackgen.files import write_atomically
-from stackgen.geometry import VIEWS
-from stackgen.metrics import SCENE_METRICS, SceneScore
+from stackgen.geometry import VIEWS, View
+from stackgen.metrics import SCENE_METRICS, SceneMetric, SceneScore
+from stackgen.stack import Stack
 from stackgen.statistics import Estimate, clustered_ratio
 
 TRUE_LIST, PREDICTED_LIST = "ground truth", "predicted"
@@ -26,11 +27,29 @@ TOP = 3
 
 _LISTS = {TRUE_LIST: "true list", PREDICTED_LIST: "predicted"}
 
-PAPER_ROWS = {
-    TRUE_LIST: {"stability": 84.20, "diversity": 66.87, "front_iou": 74.39, "avg_iou": 71.31},
-    PREDICTED_LIST: {"stability": 85.20, "diversity": 64.53, "front_iou": 75.08, "avg_iou": 71.84},
+PAPER = {
+    "Brute Force": {TRUE_LIST: (67.33, 38.73, 62.72, 58.45), PREDICTED_LIST: (58.13, 39.73, 53.39, 50.31)},
+    "Greedy": {TRUE_LIST: (68.80, 56.53, 56.01, 53.51), PREDICTED_LIST: (67.67, 57.53, 55.13, 52.72)},
+    "Tran-Reg": {TRUE_LIST: (49.73, 38.80, 44.57, 42.97), PREDICTED_LIST: (36.13, 46.73, 31.78, 30.86)},
+    "Tran-VAE": {TRUE_LIST: (71.87, 56.27, 65.46, 63.36), PREDICTED_LIST: (56.53, 60.33, 50.19, 48.58)},
+    "StackGen": {TRUE_LIST: (84.20, 66.87, 74.39, 71.31), PREDICTED_LIST: (85.20, 64.53, 75.08, 71.84)},
 }
-"""StackGen in the paper's table [%], from its own data and physics."""
+"""The paper's table [%], its columns in the order of :data:`PAPER_COLUMNS`; from its own data and physics."""
+
+PAPER_COLUMNS = ("stability", "diversity", "front_iou", "avg_iou")
+
+
+def paper_figures(method: str, block_list: str) -> dict[str, float]:
+    """A row of the paper's table [%], by metric.
+
+    >>> paper_figures("StackGen", PREDICTED_LIST)["stability"]
+    85.2
+    """
+    return dict(zip(PAPER_COLUMNS, PAPER[method][block_list], strict=True))
+
+
+PAPER_ROWS = {source: paper_figures("StackGen", source) for source in (TRUE_LIST, PREDICTED_LIST)}
+"""StackGen in the paper's table [%]."""
 
 HEADINGS = {
     "stability": "stability",
@@ -41,6 +60,20 @@ HEADINGS = {
     "iou_given_stable": "IoU if stable",
     "front_iou_before_physics": "IoU as generated",
 }
+
+
+def view_iou(view: View) -> SceneMetric:
+    """IoU of one view of the settled stacks, over the scenes that have a target for it; unstable stacks score 0."""
+
+    def metric(scene: SceneScore) -> tuple[float, float]:
+        ious = [sample.ious[view] for sample in scene.samples if view in sample.ious]
+        return float(sum(ious)), len(ious)
+
+    return metric
+
+
+METRICS: dict[str, SceneMetric] = {**SCENE_METRICS, "side_iou": view_iou("side"), "top_iou": view_iou("top")}
+"""All that is measured of a scene's samples: the protocol's metrics, and the views that its average is made of."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +87,10 @@ class SceneResult:
         fell: For each sample the numbers of the blocks that fell.
         drop: For each sample how far the block that sank most did [cell].
         list_rank: Place of the true list among the predicted ones, from 0; None if it was given.
-        feasible: Whether the predicted list can make the silhouette; None if it was given.
+        feasible: Whether the predicted list can make the silhouette; None if it was given, or cannot be told.
+        seconds: Wall time of the sampler for each sample, among those it was asked for at once; None if
+            nothing was sampled.
+        stacks: The samples themselves, as far as they were kept.
     """
 
     name: str
@@ -64,6 +100,8 @@ class SceneResult:
     drop: tuple[float, ...]
     list_rank: int | None = None
     feasible: bool | None = None
+    seconds: float | None = field(default=None, compare=False)
+    stacks: tuple[Stack, ...] = field(default=(), compare=False, repr=False)
 
 
 @dataclass(frozen=True)
@@ -89,9 +127,15 @@ class Evaluation:
     facts: dict[str, Any] = field(default_factory=dict)
 
     def estimate(self, metric: str) -> Estimate | None:
-        """A metric of :data:`stackgen.metrics.SCENE_METRICS` with its 95 % interval, clustered by scene."""
-        parts = [SCENE_METRICS[metric](scene.score) for scene in self.scenes]
+        """A metric of :data:`METRICS` with its 95 % interval, clustered by scene."""
+        parts = [METRICS[metric](scene.score) for scene in self.scenes]
         return clustered_ratio([p[0] for p in parts], [p[1] for p in parts])
+
+    @property
+    def seconds_per_sample(self) -> float | None:
+        """Mean wall time of the sampler [s]; None if nothing was sampled."""
+        known = [scene.seconds for scene in self.scenes if scene.seconds is not None]
+        return float(np.mean(known)) if known else None
 
     def list_estimates(self) -> dict[str, Estimate | None]:
         """The predictor's own metrics; empty where the true list was given."""
@@ -101,13 +145,13 @@ class Evaluation:
         hits = {
             "exact_match": [s.list_rank == 0 for s in predicted],
             f"top{TOP}": [s.list_rank is not None and s.list_rank < TOP for s in predicted],
-            "feasible": [bool(s.feasible) for s in predicted],
+            "feasible": [s.feasible for s in predicted if s.feasible is not None],
         }
         return {name: clustered_ratio(hit, np.ones(len(hit))) for name, hit in hits.items()}
 
     def summary(self) -> dict[str, Any]:
         """What `metrics.json` holds: shares in [0, 1], null where a metric does not exist."""
-        values = {name: self.estimate(name) for name in SCENE_METRICS}
+        values = {name: self.estimate(name) for name in METRICS}
         lists = self.list_estimates()
         return {
             **self.facts,

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 RESAMPLES = 2000
 """Of the bootstrap."""
@@ -45,10 +46,16 @@ def clustered_ratio(sums: ArrayLike, weights: ArrayLike, seed: int = 0) -> Estim
     if not w.sum():
         return None
     m = len(s)
-    drawn = np.random.default_rng(seed).multinomial(m, np.full(m, 1 / m), size=RESAMPLES)
+    drawn = _draws(m, seed)
     resampled_weights = drawn @ w
     kept = resampled_weights > 0  # a draw in which the metric does not exist says nothing
     ratios = (drawn @ s)[kept] / resampled_weights[kept]
     low, high = np.percentile(ratios, [2.5, 97.5])
     value = s.sum() / w.sum()
     return Estimate(float(value), float(min(low, value)), float(max(high, value)))  # not apart by rounding
+
+
+@lru_cache(maxsize=8)
+def _draws(m: int, seed: int) -> NDArray[np.float64]:
+    """(RESAMPLES, m) how often each of m scenes is drawn: the slow part, and a report asks hundreds of times."""
+    return np.random.default_rng(seed).multinomial(m, np.full(m, 1 / m), size=RESAMPLES).astype(float)

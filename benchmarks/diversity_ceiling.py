@@ -1,0 +1,163 @@
+"""How diverse valid samples can be: all layouts of a block list that fill a silhouette and stand, counted.
+
+For scenes of testset-v1, evenly spread, with the true block list and with the CNN's. The search is exact
+(stackgen.layouts); a layout stands if PyBullet says so of one of its placements. How often the scene's own
+layout is found to stand tells how complete that is: it did stand when the scene was made.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.progress import track
+
+from benchmarks.common import argument_parser, plain_table, report, start
+from stackgen.data.generation.deconstruction import surely_falls
+from stackgen.data.generation.generate import TESTSET
+from stackgen.data.shards import manifest_sha256
+from stackgen.evaluation import Scene, load_scenes
+from stackgen.layouts import PLACEMENTS, Answers, answers, expected_diversity
+from stackgen.metrics import layout
+from stackgen.protocols import Verdict
+from stackgen.reporting.known import format_layout
+from stackgen.results import PREDICTED_LIST, TRUE_LIST
+from stackgen.runs import resolve_weights
+from stackgen.sim.verdict import SimulatorChecker
+from stackgen.stack import Stack, StackgenError
+from stackgen.statistics import Estimate, clustered_ratio
+from stackgen.weights import load_predictor
+
+SAMPLES = 3
+"""Of the protocol."""
+
+Counts = NDArray[np.int64]
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    options = argument_parser(__name__, __doc__)
+    options.add_argument("--scenes", type=int, default=500, help="how many, evenly spread over the test set")
+    options.add_argument("--placements", type=int, default=PLACEMENTS, help="displaced placements to try of a design")
+    options.add_argument("--block_list_weights", default="default", help="the network that predicts the other list")
+    options.add_argument("--workers", type=int, default=1, help="processes that search")
+    return options
+
+
+def main() -> None:
+    """Search, simulate, count."""
+    options = parser().parse_args()
+    if min(options.scenes, options.workers) < 1 or options.placements < 0:
+        raise StackgenError("--scenes and --workers must be at least 1, --placements at least 0")
+    everything, manifest = load_scenes(TESTSET)
+    number = min(options.scenes, len(everything))
+    scenes = [everything[i] for i in np.linspace(0, len(everything) - 1, number).round().astype(int)]
+    predictor = load_predictor(resolve_weights(options.block_list_weights))
+    predicted = predictor.predict(np.stack([scene.silhouette for scene in scenes]), top=1)[:, 0]
+    lists = {TRUE_LIST: [scene.counts for scene in scenes], PREDICTED_LIST: list(predicted)}
+    figures: dict[str, Any] = {
+        "test_set": manifest_sha256(manifest),
+        "physics": StaticsFirst().physics.to_json(),
+        "samples": SAMPLES,
+        "placements": options.placements,
+        "block_list_weights": getattr(predictor, "card", {}).get("sha256"),
+        "lists": {},
+    }
+    for source, counts in lists.items():
+        began = time.perf_counter()
+        found = list(search(scenes, counts, options.placements, options.workers, source))
+        figures["lists"][source] = {**summary(scenes, counts, found), "seconds": time.perf_counter() - began}
+    report("diversity_ceiling", figures, tables(figures), options.out)
+
+
+class StaticsFirst:
+    """PyBullet, unless a block hangs in the air or beside its support: then it need not be asked."""
+
+    def __init__(self) -> None:
+        self.simulator = SimulatorChecker(until_fall=True)
+        self.physics = self.simulator.physics
+
+    def check(self, stack: Stack) -> Verdict:
+        """Judge one stack."""
+        if not surely_falls(stack):
+            return self.simulator.check(stack)
+        return Verdict(False, np.ones(len(stack), dtype=bool), np.ones(len(stack)), stack)
+
+
+_checker: StaticsFirst | None = None
+
+
+def _answers(job: tuple[Scene, Counts], placements: int) -> Answers:
+    """The layouts of one scene, by this process's own simulator."""
+    global _checker
+    _checker = _checker or StaticsFirst()
+    return answers(job[0].silhouette, job[1], _checker, placements=placements)
+
+
+def search(
+    scenes: Sequence[Scene], counts: Sequence[Counts], placements: int, workers: int, source: str
+) -> Iterator[Answers]:
+    """The layouts of each scene with its block list, in order."""
+    jobs, work = list(zip(scenes, counts, strict=True)), partial(_answers, placements=placements)
+    if workers == 1:
+        yield from track(map(work, jobs), f"{source} lists", total=len(jobs))
+        return
+    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        yield from track(pool.map(work, jobs), f"{source} lists", total=len(jobs))
+
+
+def summary(scenes: Sequence[Scene], counts: Sequence[Counts], found: Sequence[Answers]) -> dict[str, Any]:
+    """What was found with one kind of block list."""
+    ones = np.ones(len(found))
+    valid = np.array([len(some.valid) for some in found])
+    own = [(layout(scene.truth), some) for scene, list_, some in zip(scenes, counts, found, strict=True)
+           if scene.truth is not None and np.array_equal(list_, scene.counts)]  # fmt: skip
+    shares = {
+        "ceiling": clustered_ratio([expected_diversity(number, SAMPLES) for number in valid], ones),
+        "most_possible": clustered_ratio(np.minimum(valid, SAMPLES) / SAMPLES, ones),
+        "matching_layouts": clustered_ratio([len(some.matching) for some in found], ones),
+        "valid_layouts": clustered_ratio(valid, ones),
+        "scenes_with_one_valid_layout": clustered_ratio(valid == 1, ones),
+        "scenes_without_valid_layout": clustered_ratio(valid == 0, ones),
+        "own_layout_found_to_stand": clustered_ratio([mine in some.valid for mine, some in own], np.ones(len(own))),
+    }
+    return {
+        **{name: value and value.to_json() for name, value in shares.items()},
+        "scenes": [
+            {
+                "scene": scene.name,
+                "counts": list_.tolist(),
+                "matching": len(some.matching),
+                "valid": list(map(format_layout, some.valid)),
+            }
+            for scene, list_, some in zip(scenes, counts, found, strict=True)
+        ],
+    }
+
+
+def tables(figures: dict[str, Any]) -> list[Any]:
+    """What is printed."""
+    parts = figures["lists"]
+    names = [name for name, value in parts[TRUE_LIST].items() if isinstance(value, dict)]
+    rows = [[name.replace("_", " "), *(_text(part[name]) for part in parts.values())] for name in names]
+    rows.append(["scenes", *(str(len(part["scenes"])) for part in parts.values())])
+    rows.append(["seconds", *(f"{part['seconds']:.0f}" for part in parts.values())])
+    return [plain_table(f"Valid layouts, {SAMPLES} samples a scene, mean and 95 % interval", ("figure", *parts), rows)]
+
+
+def _text(value: dict[str, float] | None) -> str:
+    if value is None:
+        return "-"
+    estimate = Estimate(**value)
+    return f"{estimate.value:.3f} ({estimate.low:.3f} to {estimate.high:.3f})"
+
+
+if __name__ == "__main__":
+    start(main)

@@ -1,0 +1,77 @@
+"""Which scenes of testset-v1 have a layout that a training set lacks, for results on what was never seen.
+
+Reads training sets (folders or compact files) and writes, for each, the scenes that it does not hold. The
+file ships with the package, so that nobody needs the training sets to make the report.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from benchmarks.common import plain_table, start
+from stackgen.data.arrays import StackArrays, load_dataset
+from stackgen.data.generation.generate import TESTSET
+from stackgen.data.layouts_seen import seen_layouts
+from stackgen.data.shards import manifest_sha256
+from stackgen.evaluation import scenes_of
+from stackgen.files import write_atomically
+from stackgen.reporting.known import SEEN_FILE, SEEN_FORMAT
+from stackgen.stack import StackgenError
+
+NOTIONS = {"designs": True, "layouts": False}
+"""Whether the cell in which each block begins counts."""
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    options = argparse.ArgumentParser(
+        prog="python -m benchmarks.unseen_layouts", description=(__doc__ or "").partition("\n\n")[0]
+    )
+    options.add_argument("datasets", type=Path, nargs="+", help="training sets: folders or .npz files")
+    options.add_argument("--out", type=Path, default=SEEN_FILE, metavar="FILE.json", help="where to write")
+    return options
+
+
+def main() -> None:
+    """Compare, print, write."""
+    options = parser().parse_args()
+    splits, manifest = load_dataset(TESTSET, ("test",))
+    test = splits["test"]
+    entries = [compare(path, test) for path in options.datasets]
+    rows = [[entry["name"], str(entry["stacks"]), *(str(len(entry["unseen"][notion])) for notion in NOTIONS)]
+            for entry in entries]  # fmt: skip
+    heading = ("training set", "stacks", *(f"unseen {notion}" for notion in NOTIONS))
+    Console().print(plain_table(f"Of {len(test)} scenes", heading, rows))
+    content = {"format": SEEN_FORMAT, "test_set": manifest_sha256(manifest), "training_sets": entries}
+    write_atomically(options.out, (json.dumps(content) + "\n").encode())
+
+
+def compare(path: Path, test: StackArrays) -> dict[str, Any]:
+    """A training set's entry.
+
+    Raises:
+        StackgenError: If it has no training split.
+    """
+    splits, manifest = load_dataset(path, ("train",))
+    if "train" not in splits:
+        raise StackgenError(f"{path} has no training split")
+    names = [scene.name for scene in scenes_of(test)]
+    unseen = {}
+    for notion, positions in NOTIONS.items():
+        seen = seen_layouts(splits["train"], test, positions=positions)
+        unseen[notion] = [name for name, known in zip(names, seen, strict=True) if not known]
+    return {
+        "name": manifest["name"],
+        "sha256": manifest_sha256(manifest),
+        "stacks": len(splits["train"]),
+        "unseen": unseen,
+    }
+
+
+if __name__ == "__main__":
+    start(main)
