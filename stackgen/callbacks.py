@@ -25,7 +25,8 @@ class StartFrom(pl.Callback):
     """Start training from other weights, to fine-tune them; list it before EMA.
 
     Args:
-        weights: A name, a `.safetensors` file or a `.ckpt` of the same architecture.
+        weights: A name, a `.safetensors` file or a `.ckpt` of the same architecture; parts that it lacks
+            (such as an embedding that was added since) begin as they would without it.
     """
 
     def __init__(self, weights: str) -> None:
@@ -35,13 +36,18 @@ class StartFrom(pl.Callback):
         """Load them, unless the fit resumes from a checkpoint of its own."""
         if trainer.ckpt_path:
             return
+        from stackgen.runs import resolve_weights
         from stackgen.weights import read_weights  # it stands above the models, as this file does not
 
-        tensors, _ = read_weights(self.weights)
+        tensors, _ = read_weights(resolve_weights(self.weights))
         try:
-            pl_module.model.load_state_dict(tensors)  # type: ignore[union-attr]
+            missing, foreign = pl_module.model.load_state_dict(tensors, strict=False)  # type: ignore[union-attr]
         except RuntimeError as error:
             raise StackgenError(f"StartFrom: {self.weights} does not fit the model of the configuration") from error
+        if foreign or len(missing) > len(tensors) // 2:
+            raise StackgenError(f"StartFrom: {self.weights} does not fit the model of the configuration")
+        if missing:
+            print(f"StartFrom: {self.weights} has no {', '.join(missing)}: begun afresh")
 
 
 class EMA(pl.Callback):

@@ -5,6 +5,7 @@ Legend: k blocks, V vertices, H x W pixels. Lengths in cells, rotation vectors i
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from stackgen.stack import Stack
+from stackgen.stack import Stack, StackgenError
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -20,6 +21,9 @@ View = Literal["front", "side", "top"]
 VIEWS: tuple[View, ...] = ("front", "side", "top")
 
 _AXES: dict[View, tuple[int, int]] = {"front": (0, 2), "side": (1, 2), "top": (0, 1)}
+
+ROOM = 0.2
+"""Least space beside and above a full grid in its pictures [cell]: blocks are displaced, and settle."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +41,9 @@ class Grid:
         image_size: Edge of the silhouette [pixel].
         pixels_per_cell: Scale.
         ground_margin: Rows of pixels under the ground line.
+
+    Raises:
+        StackgenError: If a number is not positive (the margin: negative).
     """
 
     width: int = 4
@@ -44,6 +51,42 @@ class Grid:
     image_size: int = 64
     pixels_per_cell: float = 14.0
     ground_margin: float = 4.0
+
+    def __post_init__(self) -> None:
+        for name, whole in (("width", True), ("height", True), ("image_size", True), ("pixels_per_cell", False)):
+            value = getattr(self, name)
+            if not 0 < value < np.inf or (whole and value != round(value)):
+                kind = "a whole number of at least 1" if whole else "positive and finite"
+                raise StackgenError(f"grid: {name} must be {kind}, got {value}")
+        if not 0 <= self.ground_margin < self.image_size:
+            raise StackgenError(f"grid: ground_margin must lie in 0..image_size, got {self.ground_margin}")
+
+    def require_room(self) -> None:
+        """See that whole stacks fit into the pictures, and the pictures into bytes.
+
+        Raises:
+            StackgenError: If a structure that fills the grid has less than `ROOM` cells beside or above it,
+                or `image_size` is not a multiple of 8.
+        """
+        wide = (self.width + 2 * ROOM) * self.pixels_per_cell
+        high = (self.height + ROOM) * self.pixels_per_cell + self.ground_margin
+        need = 8 * math.ceil(max(wide, high) / 8)
+        if self.image_size < max(wide, high):
+            scale = min(
+                self.image_size / (self.width + 2 * ROOM),
+                (self.image_size - self.ground_margin) / (self.height + ROOM),
+            )
+            raise StackgenError(
+                f"grid: at {self.pixels_per_cell:g} pixels a cell, {self.width} x {self.height} cells do not fit into"
+                f" pictures of {self.image_size}; set image_size to {need} or pixels_per_cell to {math.floor(scale)}"
+            )
+        if self.image_size % 8:
+            raise StackgenError(f"grid: image_size must be a multiple of 8, got {self.image_size}")
+
+    @property
+    def cell_edge(self) -> float:
+        """x [cell] of a line between two columns of cells: 0, or 0.5 where the width is odd."""
+        return self.width % 2 / 2
 
     def horizontal(self, margin: int = 0) -> Floats:
         """World coordinate of each column's centre [cell], with `margin` extra pixels on both sides."""
@@ -112,12 +155,12 @@ def silhouette(stack: Stack, view: View = "front", grid: Grid = PAPER_GRID, marg
     rows, columns = grid.vertical(view, margin), grid.horizontal(margin)
     picture = np.zeros((len(rows), len(columns)), dtype=bool)
     for corners in block_vertices(stack):
-        left, right = _row_intervals(corners[:, _AXES[view]], rows)
+        left, right = row_intervals(corners[:, _AXES[view]], rows)
         picture |= (columns >= left[:, None]) & (columns <= right[:, None])
     return picture
 
 
-def _row_intervals(points: Floats, rows: Floats) -> tuple[Floats, Floats]:
+def row_intervals(points: Floats, rows: Floats) -> tuple[Floats, Floats]:
     """Where the convex hull of `points` (V, 2) crosses each row: leftmost and rightmost, (H,) each.
 
     Rows that miss it get the empty interval (inf, -inf).

@@ -292,7 +292,7 @@ def grid_offset(silhouette: Mask, grid: Grid = PAPER_GRID) -> int:
     """
     steps = np.diff(silhouette.astype(np.int8), axis=1, prepend=0, append=0)
     edges = np.abs(steps).sum(axis=0)  # number of rows with an edge left of each column
-    places = np.arange(len(edges)) - grid.image_size / 2
+    places = np.arange(len(edges)) - grid.image_size / 2 - grid.cell_edge * grid.pixels_per_cell
     filled = np.flatnonzero(silhouette.any(axis=0))
     half = round(grid.pixels_per_cell / 2)
     best, best_score = 0, -np.inf

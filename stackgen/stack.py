@@ -6,6 +6,7 @@ World frame: x to the right as the camera sees it, y away from the camera, z up,
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 
 MAX_BLOCKS = 10
 """N, the number of object tokens of the paper; the longest block list its models accept."""
+
+MOST_SHAPES = 127
+"""Shapes of a catalogue, at most: datasets count them in a signed byte."""
 
 Floats = NDArray[np.float64]
 
@@ -50,17 +54,25 @@ class Shape:
     def __post_init__(self) -> None:
         corners = np.asarray(self.outline, dtype=float)
         if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
-            raise StackgenError(f"shape {self.name!r}: the outline must be at least three (x, z) corners")
+            raise self._refused("must be at least three (x, z) corners, finite numbers")
         edges = np.roll(corners, -1, axis=0) - corners
         after = np.roll(edges, -1, axis=0)
         turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
         around = np.arctan2(turns, (edges * after).sum(axis=1)).sum()  # a star turns left too, but more than once
+        if np.abs(turns).max() <= 1e-9 * (edges**2).max():
+            raise self._refused("has no area; it must be convex and counter-clockwise")
+        if (turns < 0).all():
+            raise self._refused("must be convex and counter-clockwise; it is clockwise, so reverse its corners")
         if (turns <= 0).any() or abs(around - 2 * np.pi) > 1e-6:
-            raise StackgenError(f"shape {self.name!r}: the outline must be convex and counter-clockwise")
-        if np.abs(corners.min(axis=0) + corners.max(axis=0)).max() > 1e-6:
-            raise StackgenError(f"shape {self.name!r}: the outline's box must be centred on (0, 0)")
+            raise self._refused("must be convex and counter-clockwise, without a corner in the middle of an edge")
+        middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+        if np.abs(middle).max() > 5e-7:
+            raise self._refused(f"must have its box centred on (0, 0); subtract ({middle[0]:g}, {middle[1]:g})")
         if not 0 < self.depth < np.inf:
             raise StackgenError(f"shape {self.name!r}: depth must be positive and finite, got {self.depth}")
+
+    def _refused(self, reason: str) -> StackgenError:
+        return StackgenError(f"shape {self.name!r}: the outline {reason}")
 
     @cached_property
     def size(self) -> tuple[float, float, float]:
@@ -79,9 +91,14 @@ class Shape:
         return float(area), ((a + b) * cross[:, None]).sum(axis=0) / (6 * area)
 
     @property
+    def area(self) -> float:
+        """Area of the outline [cell^2]."""
+        return self._moments[0]
+
+    @property
     def volume(self) -> float:
         """Volume [cell^3]; mass is proportional to it."""
-        return self._moments[0] * self.depth
+        return self.area * self.depth
 
     @property
     def center_of_mass(self) -> Floats:
@@ -101,6 +118,16 @@ class Shape:
         """Whether the prism fills its box."""
         width, depth, height = self.size
         return abs(self.volume - width * depth * height) < 1e-9
+
+    @property
+    def level(self) -> tuple[bool, bool]:
+        """Whether there is a level edge at the bottom, to stand on, and at the top, to bear.
+
+        >>> PAPER_CATALOGUE[3].level
+        (True, False)
+        """
+        z = np.sort([corner[1] for corner in self.outline])
+        return bool(z[1] - z[0] < 1e-6), bool(z[-1] - z[-2] < 1e-6)
 
     @staticmethod
     def box(name: str, width: float, height: float = 1.0, depth: float = 1.0) -> Shape:
@@ -174,6 +201,51 @@ class Catalogue:
             raise StackgenError(
                 f'a catalogue is a list of {{"name", "outline": [[x, z], ...], "depth"}}: {error!r}'
             ) from error
+
+    @staticmethod
+    def from_config(items: Sequence[str | Mapping]) -> Catalogue:
+        """A catalogue as people write it: each entry the name of one of the paper's shapes, a box given by
+        `width` and, where they are not 1, `height` and `depth`, or a prism given by its `outline`.
+
+        Raises:
+            StackgenError: If an entry is none of these, or its name could not stand in a block list.
+
+        >>> Catalogue.from_config(["cube", {"name": "plank", "width": 2, "height": 0.5}]).names
+        ('cube', 'plank')
+        """
+        if isinstance(items, str | Mapping) or not isinstance(items, Sequence):
+            raise StackgenError(f"catalogue: it is a list of shapes, got {_short(items)}")
+        if len(items) > MOST_SHAPES:
+            raise StackgenError(f"catalogue: at most {MOST_SHAPES} shapes are possible, got {len(items)}")
+        return Catalogue(tuple(_shape_from_config(item) for item in items))
+
+
+def _shape_from_config(item: str | Mapping) -> Shape:
+    if isinstance(item, str):
+        return PAPER_CATALOGUE[PAPER_CATALOGUE.index(item)]
+    kind = {"outline"} if isinstance(item, Mapping) and "outline" in item else {"width", "height"}
+    if not isinstance(item, Mapping) or not {"name", max(kind)} <= set(item) <= {"name", "depth"} | kind:
+        raise StackgenError(
+            "catalogue: a shape is a name of the paper's, {name, width, height, depth} or {name, outline, depth},"
+            f" got {_short(item)}"
+        )
+    name = item["name"]
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w{0,99}", name, re.ASCII):
+        raise StackgenError(f"catalogue: a shape's name is letters, digits and _, from a letter on, got {_short(name)}")
+    try:
+        if "width" in item:
+            extents = [float(item.get(key, 1)) for key in ("width", "height", "depth")]
+            if not all(0 < extent < np.inf for extent in extents):
+                raise StackgenError(f"shape {name!r}: width, height and depth must be positive and finite")
+            return Shape.box(name, *extents)
+        return Shape(name, tuple((float(x), float(z)) for x, z in item["outline"]), float(item.get("depth", 1)))
+    except (TypeError, ValueError) as error:
+        raise StackgenError(f"shape {name!r}: extents are numbers, an outline [[x, z], ...]: {error}") from error
+
+
+def _short(value: object) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else f"{text[:80]} ..."
 
 
 PAPER_CATALOGUE = Catalogue(

@@ -79,11 +79,13 @@ def test_vertices_span_the_box() -> None:
         (SQUARE[:2], 1, "at least three"),
         (((0, 0, 0),) * 4, 1, "at least three"),
         (((-0.5, -0.5), (0.5, math.nan), (0.5, 0.5)), 1, "at least three"),
-        (SQUARE[::-1], 1, "convex and counter-clockwise"),
+        (SQUARE[::-1], 1, "convex and counter-clockwise.*reverse"),
+        (((-1, -1), (0, 0), (1, 1)), 1, "no area"),
+        (((0, 0), (0, 0), (0, 0)), 1, "no area"),
         (((-1, -1), (1, -1), (0, -0.5), (1, 1), (-1, 1)), 1, "convex"),
         (((-1, -1), (0, -1), (1, -1), (1, 1), (-1, 1)), 1, "convex"),
         (CENTERED_STAR, 1, "convex"),
-        (tuple((x + 1, z) for x, z in SQUARE), 1, "centred"),
+        (tuple((x + 1, z) for x, z in SQUARE), 1, r"centred.*subtract \(1, 0\)"),
         (SQUARE, 0, "depth must be positive"),
         (SQUARE, -1, "depth must be positive"),
         (SQUARE, math.nan, "depth must be positive"),
@@ -115,6 +117,56 @@ def test_the_paper_s_catalogue_survives_its_plain_form() -> None:
 def test_a_malformed_catalogue_is_refused(items: Any) -> None:
     with pytest.raises(StackgenError, match="catalogue"):
         Catalogue.from_json(items)
+
+
+def test_a_catalogue_is_written_by_names_boxes_and_outlines() -> None:
+    ramp = [[-1, -0.5], [1, -0.5], [0.5, 0.5], [-0.5, 0.5]]
+    items: list[Any] = ["triangle", {"name": "plank", "width": 2, "height": 0.5}, {"name": "ramp", "outline": ramp}]
+    catalogue = Catalogue.from_config(items)
+    assert catalogue.names == ("triangle", "plank", "ramp") and catalogue[0] == PAPER_CATALOGUE[3]
+    assert catalogue[1].size == (2, 1, 0.5) and catalogue[1].is_box
+    assert catalogue[2].area == pytest.approx(1.5) and catalogue[2].depth == 1
+    deep = Catalogue.from_config([{"name": "wall", "width": 3, "depth": 2}])
+    assert deep[0].size == (3, 2, 1) and deep[0].volume == 6 and deep[0].area == 3
+
+
+@given(st.lists(st.tuples(extents, extents, extents), min_size=1, max_size=5))
+def test_what_is_printed_of_a_catalogue_is_read_as_one_that_people_write(boxes: list[tuple[float, ...]]) -> None:
+    catalogue = Catalogue(tuple(Shape.box(f"box{i}", *box) for i, box in enumerate(boxes)))
+    assert Catalogue.from_config(catalogue.to_json()) == catalogue
+
+
+@pytest.mark.parametrize("items", ["cube", {"name": "cube"}, 3, None, [None], [[]], [{}], [{"name": "x"}], ["Cube"]])
+def test_what_is_no_list_of_shapes_is_one_line(items: Any) -> None:
+    with pytest.raises(StackgenError, match="catalogue") as caught:
+        Catalogue.from_config(items)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["a,b", "a=1", " a", "", "1a", "ä", 5, "x" * 101])
+def test_a_name_that_could_not_stand_in_a_block_list_is_refused(name: Any) -> None:
+    with pytest.raises(StackgenError, match="name is letters"):
+        Catalogue.from_config([{"name": name, "width": 1}])
+
+
+def test_more_shapes_than_a_dataset_can_count_are_refused() -> None:
+    boxes = [{"name": f"box{i}", "width": 1} for i in range(128)]
+    assert len(Catalogue.from_config(boxes[:127])) == 127
+    with pytest.raises(StackgenError, match="at most 127"):
+        Catalogue.from_config(boxes)
+
+
+@pytest.mark.parametrize(
+    ("outline", "level"),
+    [
+        (SQUARE, (True, True)),
+        (((-0.5, -0.5), (0.5, -0.5), (0, 0.5)), (True, False)),
+        (((0, -0.5), (0.5, 0.5), (-0.5, 0.5)), (False, True)),
+        (((0, -0.5), (0.5, 0), (0, 0.5), (-0.5, 0)), (False, False)),
+    ],
+)
+def test_a_level_edge_is_told_from_a_corner(outline: Any, level: tuple[bool, bool]) -> None:
+    assert Shape("s", outline).level == level
 
 
 def test_names_are_distinct_and_unknown_ones_are_answered_with_the_known() -> None:

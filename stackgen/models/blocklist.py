@@ -1,22 +1,20 @@
-"""The block-list CNN: silhouette in, a class per multiset of shapes out (paper, "Model Architecture")."""
+"""The block-list CNN: silhouette in, a distribution over block lists out (paper, "Model Architecture")."""
 
 from __future__ import annotations
 
-import itertools
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from stackgen.geometry import PAPER_GRID, Grid, Mask
+from stackgen.models.heads import MOST_CLASSES, ChainHead, ClassHead, number_of_lists
 from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, StackgenError
-
-_MOST_CLASSES = 100_000
 
 
 @dataclass(frozen=True)
@@ -29,6 +27,8 @@ class CNNConfig:
         stem_stride: Of the first convolution; above 1 the residual layers see a smaller picture (ours).
         pool: Edge of the feature map after max pooling [cells of the map].
         hidden: Width between the two fully connected layers.
+        head: `classes`, one for each block list (paper); `chain`, one shape's count after the other, for
+            worlds of too many lists (ours, see stackgen.models.heads); `auto` takes classes up to 100,000.
     """
 
     channels: int = 10
@@ -36,51 +36,50 @@ class CNNConfig:
     stem_stride: int = 1
     pool: int = 8
     hidden: int = 512
+    head: Literal["auto", "classes", "chain"] = "auto"
 
 
 class BlockListNetwork(nn.Module):
-    """Silhouettes (B, H, W) to logits (B, classes); class i stands for the block list `lists[i]`.
+    """Silhouettes (B, H, W) to a distribution over the block lists of a world.
 
     Args:
         config: See CNNConfig.
-        num_shapes, max_blocks: Size of the catalogue and N; together they fix the classes.
+        catalogue, max_blocks: Which lists there are.
+        grid: Bounds the area that a list can fill.
     """
 
-    lists: Tensor
-    keys: Tensor
-
-    def __init__(self, config: CNNConfig, num_shapes: int = 4, max_blocks: int = MAX_BLOCKS) -> None:
+    def __init__(
+        self,
+        config: CNNConfig,
+        catalogue: Catalogue = PAPER_CATALOGUE,
+        max_blocks: int = MAX_BLOCKS,
+        grid: Grid = PAPER_GRID,
+    ) -> None:
         super().__init__()
-        self.max_blocks = max_blocks
-        lists = torch.from_numpy(all_block_lists(num_shapes, max_blocks))
-        self.register_buffer("lists", lists, persistent=False)
-        self.register_buffer("keys", self._key(lists), persistent=False)
         stride = config.stem_stride
         self.stem = nn.Conv2d(1, config.channels, 2 * stride + 1, stride=stride, padding=stride)
         self.layers = nn.Sequential(*(Residual(config.channels) for _ in range(config.layers)))
         self.pool = nn.AdaptiveMaxPool2d(config.pool)
         self.hidden = nn.Linear(config.channels * config.pool**2, config.hidden)
-        self.out = nn.Linear(config.hidden, len(lists))
+        few = number_of_lists(len(catalogue), max_blocks) <= MOST_CLASSES
+        self.out: ClassHead | ChainHead
+        if config.head == "classes" or (config.head == "auto" and few):
+            self.out = ClassHead(config.hidden, len(catalogue), max_blocks)
+        else:
+            self.out = ChainHead.of_world(config.hidden, catalogue, grid, max_blocks)
 
-    def forward(self, silhouettes: Tensor) -> Tensor:
-        """Logits (B, classes)."""
+    def features(self, silhouettes: Tensor) -> Tensor:
+        """(B, H, W) silhouettes to what the head reads (B, hidden)."""
         x = self.layers(self.stem(silhouettes[:, None]))
-        return self.out(F.relu(self.hidden(self.pool(x).flatten(1))))
+        return F.relu(self.hidden(self.pool(x).flatten(1)))
 
-    def classes(self, counts: Tensor) -> Tensor:
-        """Class (B,) of each block list (B, S).
+    def forward(self, silhouettes: Tensor, counts: Tensor) -> Tensor:
+        """Log-probability (B, M) of block lists (B, M, S)."""
+        return self.out.log_probabilities(self.features(silhouettes), counts)
 
-        Raises:
-            StackgenError: If a list is empty or has more than N blocks.
-        """
-        total = counts.sum(-1)
-        if bool(((total < 1) | (total > self.max_blocks)).any()):
-            raise StackgenError(f"block lists of 1 to {self.max_blocks} blocks have a class")
-        return torch.searchsorted(self.keys, self._key(counts))
-
-    def _key(self, counts: Tensor) -> Tensor:
-        base = (self.max_blocks + 1) ** torch.arange(counts.shape[-1] - 1, -1, -1, device=counts.device)
-        return (counts * base).sum(-1)
+    def best(self, silhouettes: Tensor, top: int, limit: Tensor | None = None) -> Tensor:
+        """The most likely block lists (B, top, S), see BlockListPredictor.predict."""
+        return self.out.best(self.features(silhouettes), top, limit)
 
 
 class Residual(nn.Module):
@@ -119,31 +118,34 @@ class CNNPredictor:
         self.card = card or {}
 
     @torch.inference_mode()
-    def predict(self, silhouettes: Mask, top: int = 1) -> NDArray[np.int64]:
-        """(B, H, W) silhouettes to the `top` most likely block lists of each, (B, top, S)."""
-        best, device = [], self.network.lists.device
-        for part in np.array_split(silhouettes, max(1, math.ceil(len(silhouettes) / 256))):
-            logits = self.network(torch.from_numpy(np.ascontiguousarray(part, dtype=np.float32)).to(device))
-            best.append(self.network.lists[logits.topk(top).indices].cpu().numpy())
-        return np.concatenate(best)
+    def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """See BlockListPredictor."""
+        if top < 1:
+            raise StackgenError(f"block list: at least one is predicted, not {top}")
+        most = None if limit is None else self._lists(limit, 1)
+        return np.concatenate([self.network.best(part, top, most).cpu().numpy() for part in self._parts(silhouettes)])
 
+    @torch.inference_mode()
+    def log_probabilities(self, silhouettes: Mask, lists: ArrayLike) -> NDArray[np.float64]:
+        """(B, M) natural logarithm of the probability of each of M block lists (M, S), for each silhouette.
 
-def all_block_lists(num_shapes: int, max_blocks: int) -> NDArray[np.int64]:
-    """(classes, S) every multiset of 1..max_blocks blocks, in lexicographic order.
+        Raises:
+            StackgenError: If a list has no block, or more than N.
+        """
+        counts = self._lists(lists, 2)
+        parts = [self.network(part, counts.expand(len(part), -1, -1)) for part in self._parts(silhouettes)]
+        return torch.cat(parts).double().cpu().numpy()
 
-    Raises:
-        StackgenError: If there are too many to be classes.
+    def _parts(self, silhouettes: Mask) -> list[Tensor]:
+        """The silhouettes (B, H, W) as the network takes them, in batches."""
+        device = self.network.hidden.weight.device
+        parts = np.array_split(silhouettes, max(1, math.ceil(len(silhouettes) / 256)))
+        return [torch.from_numpy(np.ascontiguousarray(part, dtype=np.float32)).to(device) for part in parts]
 
-    >>> all_block_lists(2, 2).tolist()
-    [[0, 1], [0, 2], [1, 0], [1, 1], [2, 0]]
-    """
-    number = math.comb(num_shapes + max_blocks, num_shapes) - 1
-    if number > _MOST_CLASSES:
-        raise StackgenError(
-            f"{num_shapes} shapes and up to {max_blocks} blocks make {number} block lists, too many for a class each"
-        )
-    # Stars and bars: choose where S bars stand among N stars; what is behind the last bar is left over.
-    bars = np.array(list(itertools.combinations(range(num_shapes + max_blocks), num_shapes)))
-    counts = np.diff(bars, axis=1, prepend=-1) - 1
-    counts = counts[counts.sum(axis=1) > 0]
-    return counts[np.lexsort(counts.T[::-1])].astype(np.int64)
+    def _lists(self, counts: ArrayLike, dimensions: int) -> Tensor:
+        """Counts (..., S) where the network is."""
+        array = np.asarray(counts, dtype=np.int64)
+        if array.ndim != dimensions or array.shape[-1] != len(self.catalogue):
+            names = ", ".join(self.catalogue.names)
+            raise StackgenError(f"block list: one count for each of {names}, got an array {array.shape}")
+        return torch.from_numpy(array).to(self.network.hidden.weight.device)

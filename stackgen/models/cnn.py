@@ -6,7 +6,6 @@ from dataclasses import asdict
 from typing import Any
 
 from torch import Tensor
-from torch.nn import functional as F
 
 from stackgen._lightning import pl
 from stackgen.models.blocklist import BlockListNetwork, CNNConfig, CNNPredictor
@@ -15,7 +14,7 @@ from stackgen.models.world import WorldMixin
 
 
 class BlockListCNN(WorldMixin, pl.LightningModule):
-    """Predicts the block list from the silhouette, by cross-entropy over all lists (paper, Eq. 5).
+    """Predicts the block list from the silhouette: the true list's log-probability grows (paper, Eq. 5).
 
     Args:
         cnn: Architecture.
@@ -38,27 +37,31 @@ class BlockListCNN(WorldMixin, pl.LightningModule):
     def build(self) -> None:
         """Make the network once its world is known."""
         if not hasattr(self, "model"):
-            self.model = BlockListNetwork(self._cnn, len(self.catalogue), self.max_blocks)
+            self.model = BlockListNetwork(self._cnn, self.catalogue, self.max_blocks, self.grid)
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """One step of the cross-entropy."""
-        loss, _ = self._loss(batch)
+        features = self.model.features(batch["silhouette"])
+        loss = self._loss(features, batch["counts"])
         self.log("train/loss", loss, prog_bar=True)
         return loss
 
     def validation_step(self, batch: dict[str, Tensor], index: int) -> None:
         """Cross-entropy, exact match and top 3 on held-out stacks."""
-        loss, hits = self._loss(batch)
+        features, truth = self.model.features(batch["silhouette"]), batch["counts"]
+        loss, hits = self._loss(features, truth), self._hits(features, truth)
         size = len(hits)
         self.log("validation/loss", loss, prog_bar=True, batch_size=size, sync_dist=True)
         self.log("validation/exact", hits[:, 0].float().mean(), prog_bar=True, batch_size=size, sync_dist=True)
         self.log("validation/top3", hits.any(-1).float().mean(), batch_size=size, sync_dist=True)
 
-    def _loss(self, batch: dict[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Mean cross-entropy, and whether each of the three best classes is the true one (B, 3)."""
-        logits = self.model(batch["silhouette"])
-        truth = self.model.classes(batch["counts"])
-        return F.cross_entropy(logits, truth), logits.topk(3).indices == truth[:, None]
+    def _loss(self, features: Tensor, truth: Tensor) -> Tensor:
+        """Mean cross-entropy of the true lists (B, S)."""
+        return -self.model.out.log_probabilities(features, truth[:, None]).mean()
+
+    def _hits(self, features: Tensor, truth: Tensor) -> Tensor:
+        """Whether each of the three best lists is the true one (B, 3)."""
+        return (self.model.out.best(features, 3) == truth[:, None]).all(-1)
 
     def configure_optimizers(self) -> Any:
         """AdamW and its learning-rate course."""

@@ -18,9 +18,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from stackgen.stack import MAX_BLOCKS
+from stackgen.stack import MAX_BLOCKS, StackgenError
 
 POSE = 6
+_ROW_STEP = 0.25  # [cell] blocks of one shape whose centres differ by more lie in different rows
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,8 @@ class DenoiserConfig:
         ordered: Number the blocks of one shape from the bottom up and left to right, and embed that
             number. The paper leaves equal blocks to their noise; then each must find out among all
             permutations which one it is.
+        self_conditioning: Show the network its own last estimate of the clean poses too (Chen, Zhang
+            & Hinton 2023), so that a layout once chosen is kept to.
     """
 
     width: int = 512
@@ -53,6 +56,7 @@ class DenoiserConfig:
     stride: int = 16
     dropout: float = 0.0
     ordered: bool = False
+    self_conditioning: bool = False
 
 
 class Denoiser(nn.Module):
@@ -75,6 +79,9 @@ class Denoiser(nn.Module):
         self.shape_embedding = nn.Embedding(num_shapes, d)
         if config.ordered:
             self.rank_embedding = nn.Embedding(max_blocks, d)
+        if config.self_conditioning:
+            self.estimate_embedding = nn.Linear(POSE, d, bias=False)
+            nn.init.zeros_(self.estimate_embedding.weight)
         self.time_embedding = mlp(d, d, d)
         self.patches = Patches(config.patch, config.stride, image_size, d)
         if config.conditioning == "joint":
@@ -98,7 +105,9 @@ class Denoiser(nn.Module):
             tokens = layer(tokens, None)
         return tokens
 
-    def forward(self, poses: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor) -> Tensor:
+    def forward(
+        self, poses: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor, estimate: Tensor | None = None
+    ) -> Tensor:
         """Estimate (B, N, 6) for normalised noisy poses (B, N, 6).
 
         Args:
@@ -107,11 +116,15 @@ class Denoiser(nn.Module):
             shapes: (B, N) indices, negative at padding; if `ordered`, those of one shape in their order.
             mask: (B, N) True at blocks.
             memory: (B, C, d) of `encode`; or (B / n, C, d), serving n consecutive rows each.
+            estimate: (B, N, 6) last estimate of the clean poses, normalised; None if there is none yet,
+                or the network takes none.
         """
         time = self.time_embedding(sinusoids(t.float(), self.config.width))  # (B, d)
         tokens = self.pose_embedding(poses) + self.shape_embedding(shapes.clamp(min=0))
         if self.config.ordered:
             tokens = tokens + self.rank_embedding(ranks(shapes))
+        if estimate is not None and self.config.self_conditioning:
+            tokens = tokens + self.estimate_embedding(estimate)
         if self.config.conditioning == "joint":
             tokens = self._joint(tokens + time[:, None], mask, memory)
         else:
@@ -139,7 +152,10 @@ class Patches(nn.Module):
     def __init__(self, patch: int, stride: int, image_size: int, width: int) -> None:
         super().__init__()
         if patch > image_size or (image_size - patch) % stride:
-            raise ValueError(f"patches of {patch} pixels every {stride} do not tile {image_size} pixels")
+            raise StackgenError(
+                f"denoiser: patches of {patch} pixels every {stride} do not tile {image_size} pixels;"
+                " set patch and stride so that image_size - patch is a multiple of stride"
+            )
         self.patch, self.stride = patch, stride
         count = ((image_size - patch) // stride + 1) ** 2
         self.mlp = mlp(patch * patch, width, width)
@@ -257,9 +273,12 @@ def raster_order(poses: Tensor, shapes: Tensor) -> Tensor:
         poses: (B, N, 6) [cell, rad].
         shapes: (B, N), negative at padding.
     """
-    x, half_rows = poses[..., 0], (2 * poses[..., 2]).round()
+    x, z = poses[..., 0], poses[..., 2]
     kind = torch.where(shapes < 0, shapes.max() + 1, shapes)
-    return (kind * 1e5 + half_rows * 1e2 + x).argsort(-1)
+    upwards = (kind * 1e3 + z).argsort(-1)
+    steps = kind.gather(-1, upwards).diff(dim=-1) + (z.gather(-1, upwards).diff(dim=-1) > _ROW_STEP)
+    row = F.pad((steps > 0).cumsum(-1), (1, 0))
+    return upwards.gather(-1, (row * 1e2 + x.gather(-1, upwards)).argsort(-1))
 
 
 def mlp(inputs: int, hidden: int, outputs: int) -> nn.Sequential:

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from stackgen.geometry import PAPER_GRID, Grid, Mask
 from stackgen.models.denoiser import POSE, Denoiser, DenoiserConfig, raster_order
-from stackgen.models.samplers import ancestral
+from stackgen.models.sampler_config import SamplerConfig
+from stackgen.models.samplers import Callback, Predict, ancestral, multistep
 from stackgen.models.schedules import Schedule, ScheduleConfig
 from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Stack, StackgenError, shapes_of
 
@@ -29,7 +30,7 @@ class DiffusionConfig:
         least_std: Lower bound of the standard deviation that a dimension is divided by [cell, rad].
             Settled stacks hardly vary in y and in rotation; without a bound the rare slanted block
             would be hundreds of standard deviations away.
-        variance: Of the sampler's noise: `beta` (paper) or `posterior`, see samplers.ancestral.
+        variance: Of ancestral sampling's noise: `beta` (paper) or `posterior`, see samplers.ancestral.
     """
 
     prediction: Literal["epsilon", "v"] = "epsilon"
@@ -95,10 +96,41 @@ class PoseDiffusion(nn.Module):
         t = torch.randint(1, self.schedule.steps + 1, (len(clean),), generator=generator, device=clean.device)
         noise = torch.randn(clean.shape, generator=generator, device=clean.device, dtype=clean.dtype)
         noisy = self.schedule.diffuse(clean, noise, t)
-        estimate = self.denoiser(noisy, t, shapes, mask, self.denoiser.encode(batch["silhouette"]))
+        memory = self.denoiser.encode(batch["silhouette"])
+        seen = (
+            self._own_estimate(noisy, t, shapes, mask, memory, draws)
+            if self.denoiser.config.self_conditioning
+            else None
+        )
+        estimate = self.denoiser(noisy, t, shapes, mask, memory, seen)
         target = noise if self.config.prediction == "epsilon" else self._velocity(clean, noise, t)
         error = (estimate - target).square().mean(-1) * mask
         return error.sum(-1) / mask.sum(-1), t
+
+    @torch.no_grad()
+    def _own_estimate(
+        self, noisy: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor, draws: int
+    ) -> Tensor:
+        """What the network makes of every second draw (of every second sample, where each has one); zeros elsewhere."""
+        rows = torch.arange(len(noisy), device=noisy.device)
+        chosen = rows % 2 == 0
+        if draws == 1:
+            memory = memory[chosen]
+        elif draws % 2:
+            chosen = rows % draws < draws // 2
+        found = torch.zeros_like(noisy)
+        estimate = self.denoiser(noisy[chosen], t[chosen], shapes[chosen], mask[chosen], memory)
+        found[chosen] = self._clean(noisy[chosen], t[chosen], estimate)
+        return found
+
+    def _clean(self, x: Tensor, t: Tensor, estimate: Tensor) -> Tensor:
+        """The clean poses that an output of the network means, bounded as in the sampler."""
+        signal, sigma = self.schedule.signal_and_noise(t)
+        clean = signal * x - sigma * estimate if self.config.prediction == "v" else (x - sigma * estimate) / signal
+        return self._bounded(clean)
+
+    def _bounded(self, clean: Tensor) -> Tensor:
+        return clean if self.config.clip is None else clean.clamp(-self.config.clip, self.config.clip)
 
     def _velocity(self, clean: Tensor, noise: Tensor, t: Tensor) -> Tensor:
         signal, sigma = self.schedule.signal_and_noise(t)
@@ -111,24 +143,72 @@ class PoseDiffusion(nn.Module):
         shapes: Tensor,
         mask: Tensor,
         generator: torch.Generator,
-        callback: Callable[[int, Tensor], None] | None = None,
+        callback: Callback | None = None,
+        sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
+        guide: PoseDiffusion | None = None,
     ) -> Tensor:
-        """Poses (B, N, 6) [cell, rad] for silhouettes (B / n, H, W), each serving n rows of shapes (B, N)."""
-        memory = self.denoiser.encode(silhouettes)
+        """Poses (B, N, 6) [cell, rad] for silhouettes (B / n, H, W), each serving n rows of shapes (B, N).
 
-        def predict(x: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-            estimate = self.denoiser(x, t, shapes, mask, memory)
-            signal, sigma = self.schedule.signal_and_noise(t)
-            if self.config.prediction == "v":
-                return signal * x - sigma * estimate, sigma * x + signal * estimate
-            return (x - sigma * estimate) / signal, estimate
-
+        Args:
+            silhouettes, shapes, mask: As the denoiser takes them.
+            generator: Of all noise.
+            callback: Told (t, poses [cell, rad]) before each step and (0, poses) at the end.
+            sampler: The way from noise to poses.
+            guide: The weaker version of this model that `sampler` asks for.
+        """
+        config = self.complete(sampler)
+        predict = self._predictor(silhouettes, shapes, mask)
+        if guide is not None:
+            weak = guide._predictor(silhouettes, shapes, mask)
+            predict = self._guided(predict, weak, config)
         shown = None if callback is None else (lambda t, x: callback(t, x * self.std + self.mean))
-        noise = torch.randn((*shapes.shape, POSE), generator=generator, device=generator.device)
-        posterior = self.config.variance == "posterior"
-        start = noise.to(shapes.device)
-        x = ancestral(predict, start, self.schedule, generator, self.config.clip, posterior, shown)
+        noise = torch.randn((*shapes.shape, POSE), generator=generator, device=generator.device).to(shapes.device)
+        assert config.steps and config.spacing
+        steps = self.schedule.subset(config.steps, config.spacing)
+        if config.kind == "ddpm":
+            posterior = config.variance == "posterior"
+            x = ancestral(predict, noise, self.schedule, generator, steps, posterior, shown)
+        else:
+            order, eta = 2 if config.kind == "dpm" else 1, config.eta or 0.0
+            x = multistep(predict, noise, self.schedule, generator, steps, order, eta, shown)
         return x * self.std + self.mean
+
+    def complete(self, sampler: SamplerConfig) -> SamplerConfig:
+        """A sampler's settings with this model's own for what is null.
+
+        Raises:
+            StackgenError: If they do not fit the model.
+        """
+        return sampler.complete(self.schedule.steps, self.config.variance)
+
+    def _predictor(self, silhouettes: Tensor, shapes: Tensor, mask: Tensor) -> Predict:
+        """What estimates the clean poses of some scenes; it reads their silhouettes once."""
+        memory = self.denoiser.encode(silhouettes)
+        last: Tensor | None = None
+
+        def predict(x: Tensor, t: Tensor) -> Tensor:
+            nonlocal last
+            last = self._clean(x, t, self.denoiser(x, t, shapes, mask, memory, last))
+            return last
+
+        return predict
+
+    def _guided(self, strong: Predict, weak: Predict, config: SamplerConfig) -> Predict:
+        """Autoguidance (Karras et al. 2024): away from what a weaker version of the model would do."""
+        assert config.guided is not None and config.guidance is not None
+        first, last = (share * self.schedule.steps for share in config.guided)
+        weight = config.guidance
+
+        def predict(x: Tensor, t: Tensor) -> Tensor:
+            ours, theirs = strong(x, t), weak(x, t)
+            return self._bounded(theirs + weight * (ours - theirs)) if first <= int(t) <= last else ours
+
+        return predict
+
+    def guided_by(self, other: PoseDiffusion) -> bool:
+        """Whether another model's estimates mean the same as this one's: same schedule, same normalisation."""
+        same = torch.allclose(self.mean, other.mean, atol=1e-3) and torch.allclose(self.std, other.std, rtol=1e-3)
+        return same and self.schedule.config == other.schedule.config
 
 
 class DiffusionSampler:
@@ -139,6 +219,10 @@ class DiffusionSampler:
         catalogue, grid, max_blocks: The world it was trained in.
         card: What is known about the weights.
         batch: Stacks denoised together, at most.
+        sampler: The way from noise to poses; what is null is as the card has it, else the model.
+
+    Raises:
+        StackgenError: If the settings do not fit the model, or there is no such guide.
     """
 
     def __init__(
@@ -149,11 +233,34 @@ class DiffusionSampler:
         max_blocks: int = MAX_BLOCKS,
         card: dict[str, Any] | None = None,
         batch: int = 512,
+        sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
     ) -> None:
         self.model = model.eval()
         self.catalogue, self.grid, self.max_blocks = catalogue, grid, max_blocks
         self.card = card or {}
         self.batch = batch
+        self.sampler = self.model.complete(sampler.over(SamplerConfig.of_card(self.card)))
+        self.guide = None if self.sampler.guide is None else self._guide(self.sampler.guide)
+
+    def configured(self, sampler: SamplerConfig) -> DiffusionSampler:
+        """The same model with other settings, where they are not null."""
+        world = self.catalogue, self.grid, self.max_blocks
+        return DiffusionSampler(self.model, *world, self.card, self.batch, sampler)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """How it samples, for the record."""
+        return self.sampler.given()
+
+    def _guide(self, weights: str) -> PoseDiffusion:
+        from stackgen.weights import load_sampler  # which imports this module
+
+        other = load_sampler(weights)
+        if not isinstance(other, DiffusionSampler) or not self.model.guided_by(other.model):
+            raise StackgenError(
+                f"sampler.guide: {weights} is no diffusion model of the same noise schedule and normalisation"
+            )
+        return other.model
 
     def sample_batch(
         self,
@@ -190,6 +297,8 @@ class DiffusionSampler:
                 torch.from_numpy(np.repeat(mask, num_samples, axis=0)).to(device),
                 generator,
                 shown,
+                self.sampler,
+                self.guide,
             )
             found = poses.double().cpu().numpy().reshape(len(shapes), num_samples, -1, POSE)
             for scene, row in enumerate(found):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -58,6 +59,23 @@ class Schedule:
             self._signal[index].to(t.device)[..., None, None],
             self._noise[index].to(t.device)[..., None, None],
         )
+
+    def half_log_snr(self, t: int, before: int) -> float:
+        """By how much half the log of the signal-to-noise ratio grows from step `before` to step t >= 1."""
+        ratios = [self.alpha_bar[step].item() / (1 - self.alpha_bar[step].item()) for step in (t, before)]
+        return 0.5 * math.log(ratios[0] / ratios[1])
+
+    def subset(self, number: int, spacing: float = 1.0) -> list[int]:
+        """Some of the steps T, ..., 1, falling, T among them: T (1 - i / number)^spacing, none twice.
+
+        >>> Schedule(ScheduleConfig()).subset(5), Schedule(ScheduleConfig()).subset(5, 1.3)
+        ([50, 40, 30, 20, 10], [50, 37, 26, 15, 6])
+        """
+        chosen: list[int] = []
+        for i in range(number - 1, -1, -1):
+            step = round(self.steps * (1 - i / number) ** spacing)
+            chosen.append(max(step, chosen[-1] + 1 if chosen else 1))
+        return chosen[::-1]
 
     def diffuse(self, clean: Tensor, noise: Tensor, t: Tensor) -> Tensor:
         """Forward process (paper, Eq. 1): clean and noise (B, N, D), t (B,)."""

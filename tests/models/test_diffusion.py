@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from dataclasses import replace
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from stackgen.data.arrays import StackArrays
 from stackgen.geometry import Mask
 from stackgen.models.denoiser import DenoiserConfig
 from stackgen.models.diffusion import DiffusionConfig, DiffusionSampler, PoseDiffusion, pad_shapes
+from stackgen.models.sampler_config import SPACING, SamplerConfig
 from stackgen.models.schedules import ScheduleConfig
 from stackgen.stack import StackgenError, shapes_of
 from tests.models.conftest import TINY, TINY_CROSS
@@ -33,7 +35,9 @@ class Oracle(torch.nn.Module):
     def encode(self, silhouette: Tensor) -> Tensor:
         return torch.zeros(len(silhouette), 1, 1)
 
-    def forward(self, x: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor) -> Tensor:
+    def forward(
+        self, x: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor, seen: Tensor | None = None
+    ) -> Tensor:
         (schedule, prediction), clean = self.parts, self.clean.repeat_interleave(len(x) // len(self.clean), 0)
         signal, sigma = schedule.signal_and_noise(t)
         noise = (x - signal * clean) / sigma
@@ -43,7 +47,9 @@ class Oracle(torch.nn.Module):
 class Silent(Oracle):
     """Estimates zero."""
 
-    def forward(self, x: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor) -> Tensor:
+    def forward(
+        self, x: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor, seen: Tensor | None = None
+    ) -> Tensor:
         return torch.zeros_like(x)
 
 
@@ -240,6 +246,142 @@ def test_the_way_from_noise_is_shown_in_cells(arrays: StackArrays) -> None:
     for i, stack in enumerate(scenes[0]):
         assert seen[0][i, :k] == pytest.approx(stack.poses, abs=1e-6)
     assert np.abs((seen[50] - MEAN) / STD).mean() == pytest.approx((2 / np.pi) ** 0.5, rel=0.2)  # normal noise
+
+
+# Settings of the sampler.
+
+
+SETTINGS = [
+    SamplerConfig(),
+    SamplerConfig("ddpm", 8, variance="posterior"),
+    SamplerConfig("ddim", 8),
+    SamplerConfig("ddim", 5, spacing=2.0, eta=1.0),
+    SamplerConfig("dpm", 8),
+    SamplerConfig("dpm", 1),
+]
+
+
+@pytest.mark.parametrize("sampler", SETTINGS, ids=str)
+@pytest.mark.parametrize("prediction", ["epsilon", "v"])
+def test_a_perfect_predictor_samples_the_truth_in_every_way(
+    sampler: SamplerConfig, prediction: Prediction, batch: dict[str, Tensor]
+) -> None:
+    model = model_for(prediction)
+    batch = {**batch, "poses": torch.where(batch["mask"][..., None], batch["poses"], model.mean)}
+    model.denoiser = Oracle(model, normalised(model, batch))  # type: ignore[assignment]
+    seen: dict[int, Tensor] = {}
+    found = model.sample(
+        batch["silhouette"],
+        batch["shapes"],
+        batch["mask"],
+        generator(),
+        lambda t, x: seen.update({t: x}),
+        sampler,
+    )
+    assert found == pytest.approx(batch["poses"], abs=2e-3)
+    assert len(seen) == 1 + (sampler.steps or 50)
+
+
+def test_settings_change_the_samples_and_their_absence_nothing(arrays: StackArrays) -> None:
+    sampler = DiffusionSampler(model_for("v", TINY_CROSS))
+    scene = arrays.images([0]), arrays.counts[:1], 2, 0
+
+    def poses(settings: SamplerConfig) -> np.ndarray:
+        return np.concatenate([stack.poses for stack in sampler.configured(settings).sample_batch(*scene)[0]])
+
+    found = [poses(settings) for settings in SETTINGS]
+    assert all((a != b).any() for i, a in enumerate(found) for b in found[:i])
+    assert (found[0] == poses(SamplerConfig("ddpm", 50, variance="beta"))).all()
+
+
+def test_what_the_card_says_of_sampling_holds_unless_overridden() -> None:
+    model = model_for()
+    sampler = DiffusionSampler(model, card={"sampler": {"kind": "dpm", "steps": 8, "eta": 0.5}})
+    assert sampler.sampler == SamplerConfig("dpm", 8, SPACING, eta=0.5)
+    assert sampler.configured(SamplerConfig(steps=5)).sampler == SamplerConfig("dpm", 5, SPACING, eta=0.5)
+    assert sampler.configured(SamplerConfig("ddpm")).sampler == SamplerConfig("ddpm", 8, SPACING, variance="beta")
+    with pytest.raises(StackgenError, match="weights card"):
+        DiffusionSampler(model, card={"sampler": {"colour": "red"}})
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"steps": 51}, "this model has 50 steps"),
+        ({"steps": 0}, "at least 1"),
+        ({"eta": 0.5}, "eta is not for ddpm"),
+        ({"kind": "dpm", "variance": "beta"}, "variance is not for dpm"),
+        ({"kind": "dpm", "eta": 1.5}, "0..1"),
+        ({"spacing": 0.5}, "1..10"),
+        ({"guidance": 2.0}, "sampler.guide"),
+        ({"guidance": -1.0}, "positive"),
+        ({"guided": [0.5, 0.2]}, "two shares"),
+        ({"guide": "no-such-weights"}, "no-such-weights"),
+        ({"guide": "default"}, "another|no diffusion model of the same"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(settings: dict[str, Any], message: str) -> None:
+    with pytest.raises(StackgenError, match=message):
+        DiffusionSampler(model_for(), sampler=SamplerConfig(**settings))
+
+
+# Guidance.
+
+
+def samples_of(model: PoseDiffusion, batch: dict[str, Tensor], guide: PoseDiffusion | None, **settings: Any) -> Tensor:
+    config = SamplerConfig("ddim", 10, guide="weak" if guide else None, **settings)
+    return model.sample(batch["silhouette"], batch["shapes"], batch["mask"], generator(), None, config, guide)
+
+
+def test_guidance_moves_away_from_the_weaker_model(batch: dict[str, Tensor]) -> None:
+    """Where the weak model is off by delta, the guided estimate is off by (1 - weight) delta."""
+    strong, weak = model_for("v"), model_for("v")
+    batch = {**batch, "poses": torch.where(batch["mask"][..., None], batch["poses"], strong.mean)}
+    clean, delta = normalised(strong, batch), 0.2
+    strong.denoiser = Oracle(strong, clean)  # type: ignore[assignment]
+    weak.denoiser = Oracle(weak, clean, delta)  # type: ignore[assignment]
+    for weight in (1.0, 1.5, 3.0):
+        found = samples_of(strong, batch, weak, guidance=weight)
+        expected = (clean + (1 - weight) * delta) * strong.std + strong.mean
+        assert found == pytest.approx(expected, abs=5e-3)
+
+
+def test_guidance_keeps_to_its_interval_and_to_the_bound(batch: dict[str, Tensor]) -> None:
+    strong, weak = model_for("v", clip=1.0), model_for("v")
+    clean = torch.zeros(12, 10, 6)
+    strong.denoiser = Oracle(strong, clean)  # type: ignore[assignment]
+    weak.denoiser = Oracle(weak, clean, 0.5)  # type: ignore[assignment]
+    late, early = (
+        (samples_of(strong, batch, weak, guidance=9.0, guided=guided) - strong.mean) / strong.std
+        for guided in ((0.0, 0.3), (0.5, 1.0))
+    )
+    assert late == pytest.approx(torch.full_like(late, -1.0), abs=1e-3)  # (1 - 9) / 2, bounded
+    assert early == pytest.approx(torch.zeros_like(early), abs=2e-3)  # what came after forgot it
+
+
+def test_only_a_model_of_the_same_world_can_guide() -> None:
+    model, other = model_for(), model_for("v", TINY_CROSS)
+    assert model.guided_by(other)  # another network, another target: estimates of the clean poses are alike
+    other.fit_normalization(MEAN, STD * 2)
+    assert not model.guided_by(other)
+    assert not model.guided_by(PoseDiffusion(TINY, ScheduleConfig(steps=20), DiffusionConfig()))
+
+
+def test_the_network_is_shown_its_last_estimate(batch: dict[str, Tensor], monkeypatch: pytest.MonkeyPatch) -> None:
+    """None at the first step, then the estimate before, bounded."""
+    model, shown = model_for("v", replace(TINY_CROSS, self_conditioning=True), clip=1.5), []
+    forward = model.denoiser.forward
+
+    def watched(x: Tensor, t: Tensor, *rest: Any) -> Tensor:
+        out = forward(x, t, *rest)
+        shown.append((rest[-1], model._clean(x, t, out)))
+        return out
+
+    monkeypatch.setattr(model.denoiser, "forward", watched)
+    samples_of(model, batch, None)
+    assert shown[0][0] is None and len(shown) == 10
+    for (seen, _), (_, before) in zip(shown[1:], shown, strict=False):
+        assert (seen == before).all() and before.abs().max() <= 1.5
 
 
 def pictures(count: int, size: int = 64) -> Mask:

@@ -3,16 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from itertools import pairwise
 
 import pytest
 import torch
 from torch import Tensor
 
-from stackgen.models.samplers import Predict, ancestral
+from stackgen.models.samplers import Predict, ancestral, multistep
 from stackgen.models.schedules import Schedule, ScheduleConfig
 
 SCHEDULE = Schedule(ScheduleConfig())
 LONG = Schedule(ScheduleConfig(steps=400, beta_end=0.04))
+STEPS = [50, 37, 26, 15, 6]
+SAMPLERS: dict[str, Callable[..., Tensor]] = {
+    "ancestral beta": ancestral,
+    "ancestral posterior": partial(ancestral, posterior_variance=True),
+    "first order eta 0": multistep,
+    "first order eta 0.5": partial(multistep, eta=0.5),
+    "second order eta 0": partial(multistep, order=2),
+    "second order eta 1": partial(multistep, order=2, eta=1.0),
+}
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -26,11 +37,10 @@ def start(*shape: int, seed: int = 1) -> Tensor:
 def gaussian(schedule: Schedule, mean: float, std: float) -> Predict:
     """The exact E[x_0 | x_t] where the data are N(mean, std^2)."""
 
-    def predict(x: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    def predict(x: Tensor, t: Tensor) -> Tensor:
         bar = schedule.alpha_bar[t][:, None, None]
         gain = bar.sqrt() * std**2 / (bar * std**2 + 1 - bar)
-        clean = mean + gain * (x - bar.sqrt() * mean)
-        return clean, (x - bar.sqrt() * clean) / (1 - bar).sqrt()
+        return mean + gain * (x - bar.sqrt() * mean)
 
     return predict
 
@@ -79,9 +89,9 @@ def test_with_unit_variance_the_paper_s_fifty_steps_are_already_exact() -> None:
 def test_each_step_is_equation_3_of_the_paper(noise_of: Callable[[Tensor, int], Tensor]) -> None:
     """Whatever the predictor: x_{t-1} = (x_t - beta_t / sqrt(1 - abar_t) eps) / sqrt(alpha_t) + sqrt(beta_t) z."""
 
-    def predict(x: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-        bar, eps = SCHEDULE.alpha_bar[t][:, None, None], noise_of(x, int(t[0]))
-        return (x - (1 - bar).sqrt() * eps) / bar.sqrt(), eps
+    def predict(x: Tensor, t: Tensor) -> Tensor:
+        bar = SCHEDULE.alpha_bar[t][:, None, None]
+        return (x - (1 - bar).sqrt() * noise_of(x, int(t))) / bar.sqrt()
 
     seen: dict[int, Tensor] = {}
     noise = start(5, 3, 6)
@@ -101,20 +111,78 @@ def test_the_last_step_adds_no_noise() -> None:
     """It ends with the last estimate of the clean sample, exactly."""
     target = start(4, 2, 6, seed=3)
     for seed in range(3):
-        end = ancestral(lambda x, t: (target, x), start(4, 2, 6), SCHEDULE, generator(seed))
-        torch.testing.assert_close(end, target, rtol=0, atol=1e-12)
+        for sample in SAMPLERS.values():
+            end = sample(lambda x, t: target, start(4, 2, 6), SCHEDULE, generator(seed), STEPS)
+            torch.testing.assert_close(end, target, rtol=0, atol=1e-12)
 
 
-def test_clipping_bounds_the_estimate() -> None:
-    wild: Predict = lambda x, t: (100 * x, x)  # noqa: E731
-    end = ancestral(wild, start(8, 2, 6), SCHEDULE, generator(), clip=2.5)
-    assert end.abs().max().item() == pytest.approx(2.5)
-    tame: Predict = lambda x, t: (x.clamp(-1, 1), x)  # noqa: E731
-    free, clipped = (ancestral(tame, start(8, 2, 6), SCHEDULE, generator(), clip=c) for c in (None, 1.0))
-    assert (free == clipped).all()
-
-
-def test_same_generator_same_sample() -> None:
+@pytest.mark.parametrize("name", list(SAMPLERS))
+def test_same_generator_same_sample(name: str) -> None:
     predict = gaussian(SCHEDULE, 0, 1)
-    a, b, c = (ancestral(predict, start(3, 2, 6), SCHEDULE, generator(seed)) for seed in (4, 4, 5))
-    assert (a == b).all() and (a != c).any()
+    a, b, c = (SAMPLERS[name](predict, start(3, 2, 6), SCHEDULE, generator(seed), STEPS) for seed in (4, 4, 5))
+    assert (a == b).all()
+    if name.endswith("eta 0"):
+        assert (a == c).all()  # no noise on the way
+    else:
+        assert (a != c).any()
+
+
+def wavy(x: Tensor, t: Tensor) -> Tensor:
+    """A predictor without any law."""
+    return (x + 0.01 * t).sin()
+
+
+@pytest.mark.parametrize("steps", [STEPS, None])
+def test_eta_one_is_ancestral_sampling_with_the_posterior_s_variance(steps: list[int] | None) -> None:
+    """DDIM at eta = 1, and first-order SDE-DPM-Solver++, are DDPM (Song et al. 2021, Section 4.1)."""
+    a = ancestral(wavy, start(3, 4, 6), SCHEDULE, generator(2), steps, posterior_variance=True)
+    b = multistep(wavy, start(3, 4, 6), SCHEDULE, generator(2), steps, order=1, eta=1.0)
+    torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_two_steps_of_the_second_order_are_those_of_the_paper_s_algorithm() -> None:
+    """DPM-Solver++ (2M), Lu et al. 2022, Algorithm 2, written out with lambda, h and r."""
+    steps, seen = [50, 30, 12, 4], {}
+    noise = start(2, 3, 6)
+    end = multistep(wavy, noise, SCHEDULE, generator(), steps, order=2, callback=lambda t, x: seen.update({t: x}))
+    assert list(seen) == [*steps, 0] and (seen[0] == end).all()
+    bar = SCHEDULE.alpha_bar
+    lam = 0.5 * (bar / (1 - bar)).log()
+    x, last = noise, None
+    for i, (t, s) in enumerate(pairwise(steps)):
+        clean, h = wavy(x, torch.tensor([t])), lam[s] - lam[t]
+        data = clean
+        if last is not None:
+            r = (lam[t] - lam[steps[i - 1]]) / h
+            data = (1 + 1 / (2 * r)) * clean - 1 / (2 * r) * last
+        x = ((1 - bar[s]) / (1 - bar[t])).sqrt() * x - bar[s].sqrt() * ((-h).exp() - 1) * data
+        last = clean
+        torch.testing.assert_close(seen[s], x, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(end, wavy(x, torch.tensor([4])), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize(("mean", "std"), [(0.7, 0.4), (-0.3, 2.0)])
+def test_the_second_order_is_nearer_to_the_flow_s_end_than_the_first(mean: float, std: float) -> None:
+    """Of Gaussian data the flow from noise to data is known: it scales x about the mean."""
+    predict, noise = gaussian(LONG, mean, std), start(50, 1, 6)
+    bar = LONG.alpha_bar[LONG.steps]
+    exact = mean + (noise - bar.sqrt() * mean) * std / (bar * std**2 + 1 - bar).sqrt()
+    steps = LONG.subset(12, 2.0)
+    first, second = (multistep(predict, noise, LONG, generator(), steps, order) for order in (1, 2))
+    assert (second - exact).abs().mean() < 0.5 * (first - exact).abs().mean()
+    fine = multistep(predict, noise, LONG, generator(), None, order=2)
+    torch.testing.assert_close(fine, exact, rtol=0.01, atol=0.01)
+
+
+@pytest.mark.parametrize("eta", [0.5, 1.0])
+def test_a_few_steps_of_the_second_order_keep_the_moments_with_fresh_noise_too(eta: float) -> None:
+    x = multistep(gaussian(LONG, 0.7, 0.6), start(5000, 1, 6), LONG, generator(), LONG.subset(40), 2, eta)
+    assert x.mean().item() == pytest.approx(0.7, abs=0.03)
+    assert x.std().item() == pytest.approx(0.6, rel=0.06)
+
+
+def test_all_steps_are_those_of_the_schedule() -> None:
+    whole = list(range(50, 0, -1))
+    for sample in SAMPLERS.values():
+        a, b = (sample(wavy, start(2, 2, 6), SCHEDULE, generator(), steps) for steps in (None, whole))
+        assert (a == b).all()

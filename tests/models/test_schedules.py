@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
+import numpy as np
 import pytest
 import torch
 
@@ -63,3 +65,27 @@ def test_diffusing_mixes_each_row_at_its_own_step() -> None:
     for row, step in enumerate(t.tolist()):
         bar = schedule.alpha_bar[step].item()
         assert mixed[row] == pytest.approx(math.sqrt(bar) * clean[row] + math.sqrt(1 - bar) * noise[row], abs=1e-6)
+
+
+@pytest.mark.parametrize("spacing", [1.0, 1.3, 3.0])
+@pytest.mark.parametrize("config", CONFIGS)
+def test_a_subset_falls_from_the_last_step_and_has_none_twice(config: ScheduleConfig, spacing: float) -> None:
+    schedule = Schedule(config)
+    for number in range(1, config.steps + 1):
+        steps = schedule.subset(number, spacing)
+        assert len(steps) == number and steps[0] == config.steps and steps[-1] >= 1
+        assert all(a > b for a, b in pairwise(steps))
+    assert schedule.subset(config.steps, spacing) == list(range(config.steps, 0, -1))
+
+
+def test_spacing_moves_steps_towards_the_clean_end() -> None:
+    schedule = Schedule(ScheduleConfig())
+    even, closer = schedule.subset(8), schedule.subset(8, 2.0)
+    assert set(np.diff(even)) <= {-6, -7} and all(a >= b for a, b in zip(even, closer, strict=True))
+
+
+def test_half_the_log_of_the_signal_to_noise_ratio() -> None:
+    schedule = Schedule(ScheduleConfig())
+    signal, noise = (part[:, 0, 0] for part in schedule.signal_and_noise(torch.arange(51)))
+    grown = (signal[12] / noise[12]).log() - (signal[40] / noise[40]).log()
+    assert schedule.half_log_snr(12, 40) == pytest.approx(grown.item(), rel=1e-4)
