@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stackgen.aligned import AlignedSampler
 from stackgen.geometry import PAPER_GRID, Grid, Mask, silhouette_iou
 from stackgen.images import grid_offset, read_silhouette
-from stackgen.protocols import BlockListPredictor, StabilityChecker, StackSampler
+from stackgen.models.sampler_config import SamplerConfig
+from stackgen.protocols import BlockListPredictor, Judge, StabilityChecker, StackSampler
 from stackgen.stack import (
     MAX_BLOCKS,
     PAPER_CATALOGUE,
@@ -25,17 +28,24 @@ from stackgen.stack import (
 )
 from stackgen.stacks_file import Entry, StacksFile, Weights
 
+if TYPE_CHECKING:
+    from stackgen.inventory import Inventory
+    from stackgen.sim.physics import Physics
+    from stackgen.verification import Budget
+
 Silhouette = str | Path | NDArray[Any]
 """An image file; a (H, W) array, boolean with True where the structure is, or grey; or a colour (H, W, 3 or 4) one."""
 
 BlockList = str | Mapping[str, int] | NDArray[np.int64]
 """`"cube=3,triangle=1"`, `{"cube": 3, "triangle": 1}` or counts (S,) in catalogue order."""
 
+_LISTS_TRIED = 5  # block lists that verified sampling tries, at most
+
 DEFAULT = "default"
 """Name of the weights in the package."""
 
 
-class _Trained(Protocol):
+class Trained(Protocol):
     """What samplers and predictors read from files say of themselves."""
 
     catalogue: Catalogue
@@ -76,7 +86,12 @@ class Model:
         self._checker = checker
 
     def sample(
-        self, silhouette: Silhouette, num_samples: int = 3, seed: int = 0, blocks: BlockList | None = None
+        self,
+        silhouette: Silhouette,
+        num_samples: int = 3,
+        seed: int = 0,
+        blocks: BlockList | None = None,
+        inventory: Inventory | None = None,
     ) -> list[Stack]:
         """Stacks whose front silhouette should match; same seed, same stacks.
 
@@ -85,11 +100,15 @@ class Model:
             num_samples: How many stacks.
             seed: Of the noise.
             blocks: The block list; the network's most likely one by default.
+            inventory: The blocks there are, in the same forms: the block list is then the most likely of
+                those they allow.
 
         Raises:
-            StackgenError: If there is nothing to see in the image, or the block list is not possible.
+            StackgenError: If there is nothing to see in the image, or the block list is not possible, or
+                none is with that inventory.
         """
-        return self._draw(*self._scene(silhouette, blocks), num_samples, seed)
+        mask, lists = self._scene(silhouette, blocks, inventory)
+        return self._draw(mask, lists[0], num_samples, seed)
 
     def sample_checked(
         self,
@@ -98,32 +117,95 @@ class Model:
         seed: int = 0,
         blocks: BlockList | None = None,
         on_step: Callable[[], None] = lambda: None,
+        inventory: Inventory | None = None,
     ) -> StacksFile:
         """The stacks of :meth:`sample` with all that is known of them, as `stacks.json` holds it.
 
         Args:
-            silhouette, num_samples, seed, blocks: As there.
+            silhouette, num_samples, seed, blocks, inventory: As there.
             on_step: Called `num_samples + 1` times: once the poses are there, and after each verdict.
 
         Returns:
             Target, block list, and for each stack the simulator's verdict and the front IoU.
         """
-        mask, counts = self._scene(silhouette, blocks)
-        stacks = self._draw(mask, counts, num_samples, seed)
+        mask, lists = self._scene(silhouette, blocks, inventory)
+        stacks = self._draw(mask, lists[0], num_samples, seed)
         on_step()
         entries = []
         for stack in stacks:
             entries.append(judge(self.checker, stack, mask, self.grid))
             on_step()
+        file = self._file(tuple(entries), silhouette, mask, lists[0], blocks is None, seed, inventory)
+        return replace(file, sampler=getattr(self.sampler, "settings", None))
+
+    def sample_verified(
+        self,
+        silhouette: Silhouette,
+        num_samples: int = 3,
+        seed: int = 0,
+        blocks: BlockList | None = None,
+        inventory: Inventory | None = None,
+        verify: Judge = "simulator",
+        budget: Budget | None = None,
+        on_step: Callable[[], None] = lambda: None,
+    ) -> StacksFile:
+        """Draw many stacks, have them judged, keep the best; see stackgen.verification.
+
+        Where fewer valid stacks than asked for stand with the most likely block list, the next likely ones
+        are tried; a list that was given is never changed.
+
+        Args:
+            silhouette, num_samples, seed, blocks, inventory: As in :meth:`sample`.
+            verify: Who judges while it draws: the `simulator`, or `statics`, which is faster.
+            budget: What may be spent; 64 draws by default. With a budget of draws the same seed gives the
+                same stacks, with one of time that depends on the machine.
+            on_step: As in :meth:`sample_checked`.
+
+        Returns:
+            As :meth:`sample_checked`, the verdicts being the simulator's in any case. Its comment says what
+            was drawn and judged, that of a stack whether nothing stable was found for it.
+        """
+        from stackgen.verification import Budget, VerifiedSampler, choose_list, referee
+
+        self._check_draw(num_samples, seed)
+        mask, lists = self._scene(silhouette, blocks, inventory, top=_LISTS_TRIED)
+        checker, aligned = referee(verify, self.checker), AlignedSampler(self.sampler, self.grid)
+        sampler = VerifiedSampler(aligned, checker, budget or Budget(), self.grid, verify)
+        counts, choice, tried = choose_list(sampler, mask, lists, num_samples, seed)
+        on_step()
+        entries = []
+        for found in choice.chosen:
+            if checker is self.checker:
+                entry = Entry(found.stack, found.verdict, found.front_iou if found.verdict.stable else 0.0)
+            else:
+                entry = judge(self.checker, found.stack, mask, self.grid)
+            entries.append(replace(entry, comment="" if found.verdict.stable else "nothing stable was found for it"))
+            on_step()
+        file = self._file(tuple(entries), silhouette, mask, counts, blocks is None, seed, inventory)
+        comment = f"verified by {verify}: {choice.drawn} stacks drawn, {choice.judged} judged, {choice.stable} stable"
+        comment += f", {tried} block lists tried" if tried > 1 else ""
+        return replace(file, sampler=sampler.settings, comment=comment)
+
+    def _file(
+        self,
+        entries: tuple[Entry, ...],
+        silhouette: Silhouette,
+        mask: Mask,
+        counts: NDArray[np.int64],
+        chosen: bool,
+        seed: int,
+        inventory: Inventory | None,
+    ) -> StacksFile:
         physics = getattr(self.checker, "physics", None)
         return StacksFile(
-            tuple(entries),
+            entries,
             self.catalogue,
             self.grid,
             target=mask,
             silhouette=Path(silhouette).name if isinstance(silhouette, str | Path) else None,
             block_list=counts,
-            block_list_source="cnn" if blocks is None else "given",
+            block_list_source="cnn" if chosen else "given",
+            inventory=None if inventory is None else self.inventory(inventory),
             physics=physics.to_json() if physics else None,
             seed=seed,
             weights=self.weights,
@@ -134,9 +216,19 @@ class Model:
         """The (H, W) silhouette in an image, scaled and placed as the model knows them."""
         return read_silhouette(silhouette, self.grid)
 
-    def predict_blocks(self, silhouette: Silhouette) -> NDArray[np.int64]:
-        """(S,) the network's most likely block list for a silhouette."""
-        return self._scene(silhouette, None)[1]
+    def predict_blocks(self, silhouette: Silhouette, inventory: Inventory | None = None) -> NDArray[np.int64]:
+        """(S,) the network's most likely block list for a silhouette, of those that an inventory allows."""
+        return self._scene(silhouette, None, inventory)[1][0]
+
+    def inventory(self, inventory: Inventory) -> NDArray[np.int64]:
+        """(S,) counts of an inventory in any of its forms.
+
+        Raises:
+            StackgenError: On an unknown shape, a negative number, or no block at all.
+        """
+        from stackgen.inventory import inventory_counts
+
+        return inventory_counts(inventory, self.catalogue)
 
     def counts(self, blocks: BlockList) -> NDArray[np.int64]:
         """(S,) counts of a block list in any of its forms.
@@ -157,24 +249,40 @@ class Model:
         check_block_list(counts, self.max_blocks)
         return counts
 
-    def _scene(self, silhouette: Silhouette, blocks: BlockList | None) -> tuple[Mask, NDArray[np.int64]]:
-        """Target (H, W) and block list (S,)."""
+    def _scene(
+        self, silhouette: Silhouette, blocks: BlockList | None, inventory: Inventory | None = None, top: int = 1
+    ) -> tuple[Mask, NDArray[np.int64]]:
+        """Target (H, W) and block lists (T, S), at most `top`, the most likely first; one if it was given."""
+        if blocks is not None and inventory is not None:
+            raise StackgenError("give a block list or an inventory to choose it from, not both")
         mask = self.read(silhouette)
         if blocks is not None:
-            return mask, self.counts(blocks)
+            return mask, self.counts(blocks)[None]
         aligned = np.roll(mask, grid_offset(mask, self.grid), axis=1)
-        return mask, self.predictor.predict(aligned[None], top=1)[0, 0]
+        if inventory is None:
+            return mask, self.predictor.predict(aligned[None], top=top)[0]
+        from stackgen.inventory import allowed_lists
 
-    def _draw(self, mask: Mask, counts: NDArray[np.int64], num_samples: int, seed: int) -> list[Stack]:
+        ranks = None if self._predictor is None else lambda: self.predictor
+        world = self.catalogue, self.grid, self.max_blocks
+        counts = self.inventory(inventory)
+        try:
+            return mask, allowed_lists(aligned, counts, ranks, top, *world)
+        except StackgenError as error:
+            raise StackgenError(
+                f"{silhouette}: {error}" if isinstance(silhouette, str | Path) else str(error)
+            ) from error
+
+    @staticmethod
+    def _check_draw(num_samples: int, seed: int) -> None:
         if num_samples < 1:
             raise StackgenError(f"the number of samples must be at least 1, got {num_samples}")
         if not 0 <= seed < 2**63:
             raise StackgenError(f"the seed must be a whole number of at least 0, got {seed}")
-        # The sampler sees the structure on the cells of its grid; what it answers moves back.
-        offset = grid_offset(mask, self.grid)
-        stacks = self.sampler.sample_batch(np.roll(mask, offset, axis=1)[None], counts[None], num_samples, seed)[0]
-        back = np.array([-offset / self.grid.pixels_per_cell, 0, 0, 0, 0, 0])
-        return [stack.with_poses(stack.poses + back) for stack in stacks]
+
+    def _draw(self, mask: Mask, counts: NDArray[np.int64], num_samples: int, seed: int) -> list[Stack]:
+        self._check_draw(num_samples, seed)
+        return AlignedSampler(self.sampler, self.grid).sample_batch(mask[None], counts[None], num_samples, seed)[0]
 
     @cached_property
     def predictor(self) -> BlockListPredictor:
@@ -194,7 +302,15 @@ class Model:
             return self._checker
         from stackgen.sim.verdict import SimulatorChecker  # training machines have no PyBullet
 
-        return SimulatorChecker(catalogue=self.catalogue)
+        return SimulatorChecker(self.physics, self.catalogue)
+
+    @property
+    def physics(self) -> Physics:
+        """Of the world that the sampler was trained in."""
+        from stackgen.sim.physics import Physics
+
+        dataset = getattr(self.sampler, "card", {}).get("dataset") or {}
+        return Physics.of_world(dataset.get("physics"))
 
 
 def judge(checker: StabilityChecker, stack: Stack, target: Mask | None = None, grid: Grid = PAPER_GRID) -> Entry:
@@ -205,43 +321,69 @@ def judge(checker: StabilityChecker, stack: Stack, target: Mask | None = None, g
     return Entry(stack, verdict, silhouette_iou(verdict.settled, target, grid=grid) if verdict.stable else 0.0)
 
 
-def load(weights: str | Path = DEFAULT, block_list_weights: str | Path = DEFAULT) -> Model:
+def load(
+    weights: str | Path | StackSampler = DEFAULT,
+    block_list_weights: str | Path = DEFAULT,
+    sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
+) -> Model:
     """A model from weights.
 
     Args:
-        weights: Of the sampler: a name in the package, a `.safetensors` file, a `.ckpt` of our
-            training, or the folder of a run.
+        weights: Of the sampler: a name in the package (of weights, or of a heuristic such as
+            `brute-force`), a `.safetensors` file, a `.ckpt` of our training, or the folder of a run; or
+            a sampler itself.
         block_list_weights: Of the block-list network, likewise; read when it is first needed.
+        sampler: How a diffusion model samples, where it is not as its weights have it.
 
     Raises:
         StackgenError: If there are no such weights, or they are not ours.
     """
-    from stackgen.runs import resolve_weights
-    from stackgen.weights import load_predictor, load_sampler  # imports torch
-
-    file = resolve_weights(weights)
-    sampler = load_sampler(file)
-    about = cast(_Trained, sampler)
+    loaded_sampler, record = _sampler(weights, sampler)
+    catalogue, grid = getattr(loaded_sampler, "catalogue", PAPER_CATALOGUE), getattr(loaded_sampler, "grid", PAPER_GRID)
 
     def predictor() -> BlockListPredictor:
+        from stackgen.runs import resolve_weights
+        from stackgen.weights import load_predictor  # imports torch
+
         loaded = load_predictor(resolve_weights(block_list_weights))
-        other = cast(_Trained, loaded)
-        if (other.catalogue, other.grid) != (about.catalogue, about.grid):
+        other = cast(Trained, loaded)
+        if (other.catalogue, other.grid) != (catalogue, grid):
+            name = record.name if record else type(loaded_sampler).__name__
             raise StackgenError(
-                f"the weights {weights} and {block_list_weights} were trained with different shapes or grids: "
+                f"the weights {name} and {block_list_weights} were trained with different shapes or grids: "
                 "give both of one world"
             )
         return loaded
 
-    digest = about.card.get("sha256") or hashlib.sha256(Path(file).read_bytes()).hexdigest()
-    return Model(
-        sampler,
-        predictor,
-        catalogue=about.catalogue,
-        grid=about.grid,
-        max_blocks=about.max_blocks,
-        weights=Weights(about.card.get("name", Path(file).name), digest),
-    )
+    max_blocks = getattr(loaded_sampler, "max_blocks", MAX_BLOCKS)
+    return Model(loaded_sampler, predictor, catalogue=catalogue, grid=grid, max_blocks=max_blocks, weights=record)
+
+
+def _sampler(weights: str | Path | StackSampler, settings: SamplerConfig) -> tuple[StackSampler, Weights | None]:
+    """The sampler, and the name and the hash of its weights (a heuristic's: of its settings)."""
+    if isinstance(weights, str | Path):
+        from stackgen.runs import resolve_weights
+        from stackgen.weights import load_sampler  # imports torch
+
+        file = resolve_weights(weights)
+        loaded = load_sampler(file)
+    else:
+        file, loaded = "", weights
+    card = getattr(loaded, "card", {})
+    name, digest = card.get("name", Path(file).name), card.get("sha256")
+    if file and not digest:
+        digest = hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    record = Weights(name, digest) if name and digest else None
+    return _configured(loaded, name or type(loaded).__name__, settings), record
+
+
+def _configured(loaded: StackSampler, weights: str | Path, sampler: SamplerConfig) -> StackSampler:
+    """The sampler with settings, if any are given."""
+    if sampler == SamplerConfig():
+        return loaded
+    if not hasattr(loaded, "configured"):
+        raise StackgenError(f"{weights} is no diffusion model: leave the settings of the sampler out")
+    return loaded.configured(sampler)
 
 
 def sample(

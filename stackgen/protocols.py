@@ -5,8 +5,9 @@ Networks and heuristics answer alike, so metrics, reports and the robot never kn
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,10 @@ class Verdict:
     margin: float | None = None
 
 
+Judge = Literal["simulator", "statics"]
+"""Who can be asked for verdicts by name."""
+
+
 class StackSampler(Protocol):
     """Silhouette and block list in, stacks out: networks and heuristics alike."""
 
@@ -57,8 +62,21 @@ class StackSampler(Protocol):
 class BlockListPredictor(Protocol):
     """Silhouette in, block lists out, the most likely first."""
 
-    def predict(self, silhouettes: Mask, top: int = 1) -> NDArray[np.int64]:
-        """(B, H, W) silhouettes to (B, top, S) block lists."""
+    def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """The most likely block lists of each silhouette.
+
+        Args:
+            silhouettes: (B, H, W).
+            top: How many lists.
+            limit: (S,) an inventory: at most so many of each shape; None for no limit.
+
+        Returns:
+            (B, top, S) block lists in order of their probability; fewer than `top` where the limit
+            allows fewer.
+
+        Raises:
+            StackgenError: If the limit allows no block at all.
+        """
         ...
 
 
@@ -68,3 +86,9 @@ class StabilityChecker(Protocol):
     def check(self, stack: Stack) -> Verdict:
         """Judge one stack."""
         ...
+
+
+def check_all(checker: StabilityChecker, stacks: Sequence[Stack]) -> list[Verdict]:
+    """Judge many stacks; at once where the checker can."""
+    many = getattr(checker, "check_all", None)
+    return many(stacks) if many else [checker.check(stack) for stack in stacks]

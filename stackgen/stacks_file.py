@@ -74,6 +74,8 @@ class StacksFile:
         physics: Of the verdicts, as `Physics.to_json` gives it.
         seed: Of the sampling.
         weights: That made the stacks.
+        sampler: The settings they were sampled with.
+        inventory: (S,) counts that the block list was chosen from; None where there was no limit.
         cell_size: Edge of a cube [m].
         comment: For people.
     """
@@ -88,6 +90,8 @@ class StacksFile:
     physics: Mapping[str, Any] | None = None
     seed: int | None = None
     weights: Weights | None = None
+    sampler: Mapping[str, Any] | None = None
+    inventory: NDArray[np.int64] | None = None
     cell_size: float = 0.05
     comment: str = ""
 
@@ -126,17 +130,17 @@ def to_json(content: StacksFile) -> dict[str, Any]:
     >>> to_json(StacksFile((Entry(cube),)))["stacks"]
     [{'blocks': [{'shape': 'cube', 'position': [0.0, 0.0, 0.5], 'rotation': [0.0, 0.0, 0.0]}]}]
     """
-    names = content.catalogue.names
-    counts = content.block_list
     plain = {
         "format": FORMAT,
         "comment": content.comment or None,
         "cell_size_m": float(content.cell_size),
         "silhouette": content.silhouette,
-        "block_list": None if counts is None else {n: int(c) for n, c in zip(names, counts, strict=True) if c},
+        "block_list": _counts_to_json(content.block_list, content.catalogue),
         "block_list_source": content.block_list_source,
+        "inventory": _counts_to_json(content.inventory, content.catalogue),
         "seed": None if content.seed is None else int(content.seed),
         "weights": None if content.weights is None else asdict(content.weights),
+        "sampler": None if content.sampler is None else dict(content.sampler),
         "stacks": [_entry_to_json(entry) for entry in content.entries],
         "physics": None if content.physics is None else dict(content.physics),
         "grid": asdict(content.grid),
@@ -168,11 +172,13 @@ def from_json(data: Any) -> StacksFile:
         grid=grid,
         target=None if packed is None else _unpack(packed, grid),
         silhouette=data.get("silhouette"),
-        block_list=_counts(data.get("block_list"), catalogue),
+        block_list=_counts(data, "block_list", catalogue),
         block_list_source=data.get("block_list_source"),
         physics=physics,
         seed=data.get("seed"),
         weights=None if weights is None else Weights(**weights),
+        sampler=data.get("sampler"),
+        inventory=_counts(data, "inventory", catalogue),
         cell_size=cell_size,
         comment=data.get("comment", ""),
     )
@@ -322,13 +328,19 @@ def _verdict_from_json(said: Mapping[str, Any], stack: Stack, path: str) -> Verd
     return Verdict(said["stable"], fell, drop, settled, said.get("at_rest", True), said.get("margin"))
 
 
-def _counts(items: Mapping[str, int] | None, catalogue: Catalogue) -> NDArray[np.int64] | None:
-    """(S,) block list."""
+def _counts_to_json(counts: NDArray[np.int64] | None, catalogue: Catalogue) -> dict[str, int] | None:
+    """Counts (S,) by name, without zeros."""
+    return None if counts is None else {n: int(c) for n, c in zip(catalogue.names, counts, strict=True) if c}
+
+
+def _counts(data: Mapping[str, Any], key: str, catalogue: Catalogue) -> NDArray[np.int64] | None:
+    """(S,) counts that stand under a key."""
+    items = data.get(key)
     if items is None:
         return None
     for name in items:
         if name not in catalogue.names:
-            raise StackgenError(f"$.block_list: unknown shape {_short(name)}; there are {', '.join(catalogue.names)}")
+            raise StackgenError(f"$.{key}: unknown shape {_short(name)}; there are {', '.join(catalogue.names)}")
     return np.array([items.get(name, 0) for name in catalogue.names], dtype=np.int64)
 
 

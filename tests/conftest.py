@@ -11,12 +11,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from hypothesis import settings
 from numpy.typing import NDArray
 
 from stackgen.api import Model
 from stackgen.cli import main
 from stackgen.geometry import Mask
 from stackgen.stack import Stack, shapes_of
+
+settings.register_profile("patient", deadline=None)  # on a busy machine the slowest example says nothing
+settings.load_profile("patient")
 
 
 class Answer(NamedTuple):
@@ -81,7 +85,7 @@ class TowerSampler:
 class ThreeCubes:
     """Predicts three cubes, whatever the silhouette."""
 
-    def predict(self, silhouettes: Mask, top: int = 1) -> NDArray[np.int64]:
+    def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """(B, top, S) block lists."""
         return np.tile(np.array([3, 0, 0, 0]), (len(silhouettes), top, 1))
 

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import stackgen
-from stackgen.api import Model
+from stackgen.api import Model, _configured, judge
 from stackgen.geometry import PAPER_GRID, Mask, mirror, silhouette
+from stackgen.models.sampler_config import SPACING, SamplerConfig
 from stackgen.stack import Stack, StackgenError
 from stackgen.stacks_file import read_stacks
+from stackgen.verification import Budget
 from tests.conftest import Cli, TinyWeights
 
 
@@ -74,7 +76,6 @@ def test_what_falls_has_no_iou_and_what_stands_has_its_silhouettes(towers: Model
     tower = Stack(np.array([0, 0]), np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]]))
     floating = tower.with_poses(tower.poses + [0, 0, 2, 0, 0, 0])
     target = silhouette(tower)
-    judge = stackgen.api.judge
     assert judge(towers.checker, tower, target).front_iou == pytest.approx(1, abs=0.02)
     assert judge(towers.checker, floating, target).front_iou == 0
     assert judge(towers.checker, tower).front_iou is None
@@ -117,3 +118,131 @@ def test_the_sampler_sees_the_structure_on_the_cells_of_its_grid_and_the_answer_
     edges = np.flatnonzero(np.diff(sampler.seen[40].astype(int))) + 1 - PAPER_GRID.image_size / 2
     assert np.all(edges % PAPER_GRID.pixels_per_cell == 0)  # a tower of odd width stands half a cell beside the middle
     assert abs(stacks[0].poses[0, 0]) < 1e-9  # and yet the answer is where the drawing was
+
+
+def test_settings_of_the_sampler_reach_it_and_the_file(tiny: TinyWeights, tower_image: Path) -> None:
+    few = stackgen.load(tiny.sampler, tiny.predictor, SamplerConfig("dpm", 4))
+    result = few.sample_checked(tower_image, num_samples=2)
+    assert result.sampler == {"kind": "dpm", "steps": 4, "spacing": SPACING, "eta": 0.0}
+    assert same(result.stacks, few.sample(tower_image, num_samples=2))
+    assert not same(result.stacks, stackgen.load(tiny.sampler, tiny.predictor).sample(tower_image, num_samples=2))
+
+
+def test_settings_are_for_diffusion_models_alone() -> None:
+    with pytest.raises(StackgenError, match="no diffusion model"):
+        _configured(Remembers(), "heuristic", SamplerConfig("dpm"))
+    assert isinstance(_configured(Remembers(), "heuristic", SamplerConfig()), Remembers)
+
+
+class Towers:
+    """Straight towers where the target is: they stand, but those of three blocks begin in the air."""
+
+    def sample_batch(
+        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
+    ) -> list[list[Stack]]:
+        scenes = []
+        for mask, list_ in zip(silhouettes, counts, strict=True):
+            k = int(list_.sum())
+            poses = np.zeros((k, 6))
+            poses[:, 0] = (np.flatnonzero(mask.any(axis=0)).mean() - 31.5) / PAPER_GRID.pixels_per_cell
+            poses[:, 2] = np.arange(k) + 0.5 + 3 * (k == 3)
+            noise = np.random.default_rng(seed).uniform(-0.01, 0.01, num_samples)
+            scenes.append([Stack(np.zeros(k, dtype=np.int64), poses + [x, 0, 0, 0, 0, 0]) for x in noise])
+        return scenes
+
+
+class TwoLists:
+    """Predicts three cubes, then four."""
+
+    def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        lists = np.array([[3, 0, 0, 0], [4, 0, 0, 0]])
+        lists = lists if limit is None else lists[(lists <= limit).all(axis=1)]
+        return np.tile(lists[:top], (len(silhouettes), 1, 1))
+
+
+FOUR = silhouette(Stack(np.zeros(4, dtype=np.int64), np.array([[0, 0, z + 0.5, 0, 0, 0] for z in range(4)])))
+
+
+@pytest.fixture
+def four() -> Model:
+    return Model(Towers(), TwoLists())
+
+
+def test_verified_stacks_come_with_verdicts_and_what_was_spent(four: Model) -> None:
+    steps: list[None] = []
+    result = four.sample_verified(FOUR, 2, seed=3, blocks="cube=4", on_step=lambda: steps.append(None))
+    assert len(steps) == 3 and result.comment == "verified by simulator: 8 stacks drawn, 2 judged, 2 stable"
+    assert result.sampler == {"verify": "simulator", "draws": 64}
+    assert same(result.stacks, four.sample_verified(FOUR, 2, seed=3, blocks="cube=4").stacks)
+    assert not same(result.stacks, four.sample_verified(FOUR, 2, seed=4, blocks="cube=4").stacks)
+    for entry in result.entries:
+        assert entry.verdict and entry.verdict.stable and not entry.comment
+        assert entry.front_iou == judge(four.checker, entry.stack, result.target).front_iou
+        assert entry.front_iou is not None and entry.front_iou > 0.95
+
+
+def test_statics_may_judge_and_the_simulator_has_the_last_word(four: Model) -> None:
+    result = four.sample_verified(FOUR, 1, blocks="cube=4", verify="statics", budget=Budget(8))
+    verdict = result.entries[0].verdict
+    assert verdict is not None and verdict.margin is None  # the simulator's verdict has none
+    assert result.sampler == {"verify": "statics", "draws": 8}
+    with pytest.raises(StackgenError, match="simulator or statics"):
+        four.sample_verified(FOUR, verify="guess")  # type: ignore[arg-type]
+
+
+def test_another_list_is_tried_unless_one_was_given(four: Model) -> None:
+    found = four.sample_verified(FOUR, 1, budget=Budget(8))
+    assert found.block_list is not None and found.block_list.tolist() == [4, 0, 0, 0]
+    assert found.entries[0].verdict and found.entries[0].verdict.stable and "2 block lists" in found.comment
+    given = four.sample_verified(FOUR, 1, blocks="cube=3", budget=Budget(8))
+    assert given.block_list is not None and given.block_list.tolist() == [3, 0, 0, 0]
+    assert given.entries[0].verdict and not given.entries[0].verdict.stable and given.entries[0].front_iou == 0
+    assert given.entries[0].comment == "nothing stable was found for it"
+
+
+def test_the_block_list_comes_from_the_inventory(four: Model) -> None:
+    assert four.sample(FOUR, 1)[0].names == ["cube"] * 3
+    assert four.sample(FOUR, 1, inventory="cube=7,rectangle=9")[0].names == ["cube"] * 4
+    assert four.predict_blocks(FOUR, {"cube": 7}).tolist() == [4, 0, 0, 0]
+    checked = four.sample_checked(FOUR, 1, inventory={"cube": 7})
+    assert checked.inventory is not None and checked.inventory.tolist() == [7, 0, 0, 0]
+    assert checked.block_list_source == "cnn" and checked.block_list is not None
+    assert four.sample_verified(FOUR, 1, inventory="cube=4").entries[0].front_iou > 0.95  # type: ignore[operator]
+    with pytest.raises(StackgenError, match="too small"):
+        four.sample(FOUR, 1, inventory="cube=1")
+    with pytest.raises(StackgenError, match="not both"):
+        four.sample(FOUR, 1, blocks="cube=2", inventory="cube=2")
+
+
+def test_the_command_line_verifies_and_answers_by_its_exit_code(
+    cli: Cli, four: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stackgen.commands.sample.load", lambda *names: four)
+    Image.fromarray(FOUR).save(tmp_path / "four.png")
+    options = tmp_path / "four.png", "--num_samples", 2, "--out", tmp_path / "out"
+    answer = cli("sample", "--blocks", "cube=4", "--verify", "--budget", "30s", *options)
+    assert answer.code == 0 and "four.png: verified by simulator: 8 stacks drawn, 2 judged, 2 stable" in answer.out
+    answer = cli("sample", "--blocks", "cube=3", "--verify", "simulator", "--budget", "8", *options)
+    assert answer.code == 1 and "stack 1 falls: nothing stable was found for it" in answer.out
+    assert read_stacks(tmp_path / "out" / "stacks.json").sampler == {"verify": "simulator", "draws": 8}
+    assert cli("sample", "--blocks", "cube=3", *options).code == 0  # unverified, it only reports
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--budget", "1s"], "--verify"),
+        (["--verify", "--budget", "soon"], "a time, such as 1s"),
+        (["--inventory", "cube=1"], "tower.png: the inventory cube=1 is too small"),
+        (["--inventory", "cone=1"], "unknown shape 'cone'"),
+        (["--inventory", "cube=9", "--blocks", "cube=3"], "not both"),
+        (["--sampler.steps", "0"], "at least 1"),
+        (["--verify", "guess"], "guess"),
+    ],
+)
+def test_what_cannot_be_asked_is_one_line(
+    options: list[str], message: str, cli: Cli, towers: Model, tower_image: Path, tmp_path: Path
+) -> None:
+    answer = cli("sample", tower_image, "--out", tmp_path / "out", *options)
+    assert answer.code == 2 and message in answer.line
+    assert not (tmp_path / "out").exists()

@@ -30,19 +30,39 @@ CONFIGS = Path(__file__).parents[1] / "configs"
 QUICK = CONFIGS / "quick.yaml"
 OVERLAY = CONFIGS / "warm-start.yaml"  # no configuration of its own
 ALL = sorted(path for path in CONFIGS.rglob("*.yaml") if path != OVERLAY)
-VERB_OF_FOLDER = {"generate": "generate", "model": "fit"}
+WORLDS = CONFIGS / "worlds"
+VERB_OF_FOLDER = {"generate": "generate", "model": "fit", "baselines": "fit"}
 
 Load = Callable[[Path], dict[str, Any]]
 
 
 def verbs(path: Path) -> list[str]:
-    """Whose options a file holds: those of its folder's verb, or of each verb that has a section in it."""
-    folder = VERB_OF_FOLDER.get(path.parent.name)
-    return [folder] if folder else [verb for verb in VERBS if verb in yaml.safe_load(path.read_text())]
+    """Whose options a file holds: of each verb that has a section in it, or else those of its folder's verb."""
+    content = yaml.safe_load(path.read_text())
+    sections = [verb for verb in VERBS if isinstance(content.get(verb), dict)]
+    if sections or WORLDS not in path.parents:
+        return sections or [VERB_OF_FOLDER[folder] for folder in (path.parent.name,) if folder in VERB_OF_FOLDER]
+    return ["generate" if path.stem == "generate" else "fit"]
+
+
+def name_of(path: Path) -> str:
+    """What a configuration's dataset or run is called, so that it is found."""
+    if WORLDS not in path.parents:
+        return path.stem
+    world = path.parent.name
+    return world if path.stem == "generate" else f"{world}-{path.stem}"
 
 
 def of(verb: str) -> list[Any]:
-    return [pytest.param(path, id=path.stem) for path in ALL if verb in verbs(path)]
+    return [pytest.param(path, id=name_of(path)) for path in ALL if verb in verbs(path)]
+
+
+def settings_of(path: Path) -> GenerateSettings:
+    """What a configuration of `generate` describes."""
+    parser = GENERATE.parser()
+    values = parse(parser, "generate", own_sections("generate", ["--config", str(path), "--out", "x"]))
+    values = parser.instantiate(values)
+    return GenerateSettings(**{name: values[name] for name in GenerateSettings.__dataclass_fields__})
 
 
 @pytest.fixture
@@ -57,14 +77,18 @@ def fit_options(cli: Cli) -> Load:
     return load
 
 
-def build(options: dict[str, Any]) -> tuple[Any, StackDataModule, list[Callback]]:
-    """Training module with its network, data module and callbacks."""
+def build(
+    options: dict[str, Any], world: GenerateSettings | None = None
+) -> tuple[Any, StackDataModule, list[Callback]]:
+    """Training module with its network, data module and callbacks; in the paper's world by default."""
     parser = ArgumentParser(exit_on_error=False)
     parser.add_subclass_arguments(LightningModule, "model")
     parser.add_class_arguments(StackDataModule, "data")
     parser.add_argument("--callbacks", type=list[Callback])
     chosen = {"model": options["model"], "data": options["data"], "callbacks": options["trainer"]["callbacks"]}
     made = parser.instantiate_classes(parser.parse_object(chosen))
+    if world is not None:
+        made.model.catalogue, made.model.grid, made.model.max_blocks = world.catalogue, world.grid, world.max_blocks
     made.model.build()
     return made.model, made.data, made.callbacks
 
@@ -84,32 +108,42 @@ def test_a_warm_start_is_laid_over_a_model(cli: Cli) -> None:
 
 @pytest.mark.parametrize("path", of("generate"))
 def test_a_dataset_s_settings_are_made(path: Path) -> None:
-    parser = GENERATE.parser()
-    values = parse(parser, "generate", own_sections("generate", ["--config", str(path), "--out", "x"]))
-    values = parser.instantiate(values)
-    given = {name: values[name] for name in GenerateSettings.__dataclass_fields__}
-    settings = GenerateSettings(**given)
-    assert settings.name == path.stem
-    assert settings.exclude_testset == (settings.name != "testset-v1")
+    settings = settings_of(path)
+    assert settings.name == name_of(path)
+    assert settings.exclude_testset == (settings.name != "testset-v1" and WORLDS not in path.parents)
 
 
 @pytest.mark.parametrize("path", of("fit"))
 def test_a_model_is_built_and_learns_from_a_batch(path: Path, fit_options: Load) -> None:
     options = fit_options(path)
-    assert options["name"] == path.stem  # where its run is looked for
-    module, _, callbacks = build(options)
+    assert options["name"] == name_of(path)  # where its run is looked for
+    world = settings_of(path.with_name("generate.yaml")) if WORLDS in path.parents else GenerateSettings("paper", 1)
+    module, _, callbacks = build(options, world)
     assert callbacks
+    counts = torch.eye(len(world.catalogue), dtype=torch.long)[[0, 1]]
+    counts[:, -1] += torch.tensor([1, 2])  # a cube and a triangle, a rectangle and two
+    last = len(world.catalogue) - 1
     batch = {
-        "shapes": torch.tensor([[0, 3, -1], [1, 0, 0]]),
+        "shapes": torch.tensor([[0, last, -1], [1, last, last]]),
         "poses": torch.randn(2, 3, 6),
         "mask": torch.tensor([[True, True, False], [True, True, True]]),
-        "silhouette": torch.ones(2, 64, 64),
-        "counts": torch.tensor([[1, 0, 0, 1], [2, 1, 0, 0]]),
+        "silhouette": torch.ones(2, world.grid.image_size, world.grid.image_size),
+        "counts": counts,
     }
-    loss = module.model.loss(batch, module.draws)[0].mean() if isinstance(module, DDPM) else module._loss(batch)[0]
-    loss.backward()
-    assert loss.isfinite()
+    loss_of(module, batch).backward()
     assert any(p.grad is not None and p.grad.abs().sum() > 0 for p in module.parameters())
+
+
+def loss_of(module: Any, batch: dict[str, torch.Tensor]) -> torch.Tensor:
+    """The training loss of a batch; finite."""
+    if isinstance(module, DDPM):
+        loss = module.model.loss(batch, module.draws)[0].mean()
+    elif isinstance(module, BlockListCNN):
+        loss = module._loss(module.model.features(batch["silhouette"]), batch["counts"])
+    else:
+        loss = module.training_step(batch, 0)
+    assert loss.isfinite()
+    return loss
 
 
 def test_the_paper_s_denoiser_is_the_paper_s(fit_options: Load) -> None:
@@ -135,7 +169,7 @@ def test_the_paper_s_classifier_is_the_paper_s(fit_options: Load) -> None:
     network = module.model
     assert len(network.layers) == 30
     assert network.stem(torch.zeros(1, 1, 64, 64)).shape == (1, 10, 64, 64)
-    assert network(torch.zeros(1, 64, 64)).shape == (1, 1000)  # 14 over 4 multisets of at most ten, less the empty one
+    assert network.out.out_features == 1000  # 14 over 4 multisets of at most ten, less the empty one
 
 
 def test_quick_has_stacks_for_every_split() -> None:

@@ -10,6 +10,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from rich.console import Console
 from torch.utils.data import DataLoader
 
@@ -21,7 +22,7 @@ from stackgen.evaluation import ParallelChecker, SamplerEvaluation, Scene, ceili
 from stackgen.geometry import PAPER_GRID, Mask, silhouette
 from stackgen.metrics import SCENE_METRICS
 from stackgen.protocols import Verdict
-from stackgen.results import Evaluation, format_list_table, format_table, write_metrics, write_scenes
+from stackgen.results import METRICS, Evaluation, format_list_table, format_table, write_metrics, write_scenes
 from stackgen.sim.verdict import SimulatorChecker
 from stackgen.stack import PAPER_CATALOGUE, Stack, StackgenError
 from stackgen.statistics import clustered_ratio
@@ -79,7 +80,7 @@ class Lists:
     def __init__(self, scenes: list[Scene]) -> None:
         self.known = {scene.silhouette.tobytes(): (i, scene.counts) for i, scene in enumerate(scenes)}
 
-    def predict(self, silhouettes: Mask, top: int = 1) -> np.ndarray:
+    def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> np.ndarray:
         answers = []
         for image in silhouettes:
             number, counts = self.known[image.tobytes()]
@@ -191,7 +192,7 @@ def test_metrics_json_says_what_was_measured_and_how(some: Evaluation, tmp_path:
     found = json.loads((tmp_path / "metrics.json").read_text())
     assert (found["scenes"], found["samples"], found["samples_per_scene"], found["seed"]) == (20, 60, 3, 0)
     assert found["block_list"] == "predicted" and found["weights"] == "default"
-    assert set(found["metrics"]) == set(SCENE_METRICS) and set(found["block_lists"]) == {
+    assert set(found["metrics"]) == set(METRICS) and set(found["block_lists"]) == {
         "exact_match", "top3", "feasible",
     }  # fmt: skip
     for estimate in found["metrics"].values():

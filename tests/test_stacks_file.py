@@ -57,6 +57,8 @@ def full() -> StacksFile:
         Physics().to_json(),
         2**40,
         Weights("default", "0123456789abcdef" * 4),
+        {"kind": "ddim", "steps": 8, "guided": [0.5, 1.0]},
+        np.array([4, 0, 2, 0, 2]),
         0.05,
         "all of it",
     )
@@ -176,7 +178,7 @@ WRONG: list[tuple[list[Any], Any, str]] = [
     (["silhouette_packed"], {"size": [64, 64], "bits": "AAAA"}, r"\$\.silhouette_packed\.bits: 3 bytes, but"),
     (["silhouette_packed"], {"size": [64, 64], "bits": "%"}, r"\$\.silhouette_packed\.bits: is not base64"),
     (["silhouette_packed"], {"size": [8, 8], "bits": "AAAA"}, r"\$\.silhouette_packed\.size is 8 x 8"),
-    (["catalogue"], [{"name": "cube", "outline": [[0, 0], [1, 0], [1, 1]]}], "must be centred"),
+    (["catalogue"], [{"name": "cube", "outline": [[0, 0], [1, 0], [1, 1]]}], "must have its box centred"),
     (["catalogue"], PAPER_CATALOGUE.to_json() * 2, "distinct names"),
     (["typo"], 1, r"\$: .*'typo' was unexpected"),
 ]

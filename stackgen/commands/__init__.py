@@ -8,19 +8,38 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 import yaml
-from jsonargparse import ArgumentError, ArgumentParser, DefaultHelpFormatter, Namespace
+from jsonargparse import ArgumentError, ArgumentParser, DefaultHelpFormatter, Namespace, set_parsing_settings
+from jsonargparse.typing import register_type
 from omegaconf.errors import OmegaConfBaseException
 
-from stackgen.stack import StackgenError
+from stackgen.stack import Catalogue, StackgenError
+
+
+def _catalogue(value: Any) -> Catalogue:
+    """A catalogue from what stands in YAML, or from what jsonargparse makes of a default."""
+    if isinstance(value, Mapping) and "init_args" in value:
+        return Catalogue(value["init_args"]["shapes"])
+    return Catalogue.from_config(value)
+
+
+# In YAML a catalogue is a list of shapes, and no group of options.
+register_type(Catalogue, Catalogue.to_json, _catalogue)
+set_parsing_settings(subclasses_enabled=[Catalogue])
 
 CONFIG_FLAGS = ("-c", "--config")
 CONFIG_HELP = "YAML file with these options, or with a section named like the verb that holds them."
 
 
 class HelpFormatter(DefaultHelpFormatter, argparse.RawDescriptionHelpFormatter):
-    """Leaves the line breaks of the example under a help alone."""
+    """Leaves the line breaks of the example under a help alone, and names a catalogue's shapes."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        if isinstance(action.default, Mapping) and "shapes" in action.default.get("init_args", ()):
+            return f"{action.help} (default: {', '.join(_catalogue(action.default).names)})"
+        return super()._get_help_string(action)
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,10 @@ def main(
         file: A stacks.json, hand-written ones too.
         out: Write the file again here, with verdicts and settled poses; with --explain also with margins.
         explain: Also ask an equilibrium check, and say why blocks cannot be held.
-        physics: Of the simulation; the cell size is the file's.
+        physics: Of the simulation; friction and whatever else makes the world are the file's unless given.
     """
     content = read_stacks(file)
-    physics = replace(physics, cell_size=content.cell_size)
+    physics = replace(Physics.of_world(content.physics, physics), cell_size=content.cell_size)
     checker = SimulatorChecker(physics, content.catalogue)
     judged = replace(
         content,

@@ -24,9 +24,11 @@ from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
 from stackgen.commands import CONFIG_FLAGS, HelpFormatter, epilog, option_values, own_sections, parse
 from stackgen.commands.protocol import WeightsUnderTest, run_protocol, write_predictions
 from stackgen.data.datamodule import TESTSET, StackDataModule
+from stackgen.data.physics import warn_of_other_physics
 from stackgen.files import write_atomically
 from stackgen.models.world import CHECKPOINT_KEY
 from stackgen.runs import RUNS, config_of, last_checkpoint, new_run
+from stackgen.sim.physics import Physics
 from stackgen.stack import StackgenError
 
 EXAMPLES = {
@@ -99,6 +101,8 @@ class StackgenCLI(LightningCLI):
         config = self.config[verb]
         if config.get("model") is None:
             raise StackgenError(f"no model: give one, e.g. stackgen {verb} --config configs/model/ddpm-small.yaml")
+        if config.ckpt_path is not None and _is_protocol(str(config.model.class_path)):
+            raise StackgenError(f"{verb}: the model says which weights; give --ckpt_path without a configuration")
         root = Path(config.trainer.default_root_dir)
         if config.ckpt_path == "last":
             config.ckpt_path = str(last_checkpoint(root / config.name))
@@ -111,7 +115,11 @@ class StackgenCLI(LightningCLI):
         self.folder: Path | None = None
         if not config.fast_dev_run:
             if verb in ("fit", "validate"):
-                _ = self.datamodule.manifest  # a mistake in the path must not leave an empty run behind
+                manifest = self.datamodule.manifest  # a mistake in the path must not leave an empty run behind
+                if not int(os.environ.get("LOCAL_RANK", 0)):
+                    made = manifest.get("physics")
+                    here = Physics.of_world(made).to_json()
+                    warn_of_other_physics(f"dataset {self.datamodule.path}", made, here)
             kind = "version" if verb == "fit" else verb
             self.folder = _run_folder(self._get(self.config, "name"), Path(config.default_root_dir), kind)
             if config.logger in (None, True):
@@ -167,21 +175,46 @@ def _parser_options() -> dict[str, Any]:
 def _complete(verb: str, arguments: list[str]) -> list[str]:
     """Fill in what goes without saying.
 
-    `test` and `predict` are about weights on the frozen test set unless a model is given; for
-    `fit` and `validate` the configuration lies beside a run's checkpoint.
+    `test` and `predict` are about weights unless another model is given, and ask them about the frozen
+    test set; for `fit` and `validate` the configuration lies beside a run's checkpoint.
     """
-    if option_values(arguments, (*CONFIG_FLAGS, "--model")):
-        return arguments
-    checkpoints = [value for _, value in option_values(arguments, ("--ckpt_path",))]
+    for _, value in option_values(arguments, ("--ckpt_path", "--model.weights")):
+        _check_binary(Path(value))
+    given = [value for _, value in option_values(arguments, (*CONFIG_FLAGS, "--model"))]
+    frozen = ["--data.path", str(TESTSET), "--data.eval_batch_size", "64"]
+    if given:
+        return [*frozen, *arguments] if verb in ("test", "predict") and any(map(_is_protocol, given)) else arguments
     if verb in ("test", "predict"):
-        weights = ["--model", f"{WeightsUnderTest.__module__}.WeightsUnderTest", "--data.path", str(TESTSET)]
-        batch = ["--data.eval_batch_size", "64"]
-        return [*weights, *batch, *(a.replace("--ckpt_path", "--model.weights", 1) for a in arguments)]
+        weights = ["--model", f"{WeightsUnderTest.__module__}.WeightsUnderTest", *frozen]
+        return [*weights, *(a.replace("--ckpt_path", "--model.weights", 1) for a in arguments)]
+    checkpoints = [value for _, value in option_values(arguments, ("--ckpt_path",))]
     found = [path for path in (config_of(Path(checkpoint)) for checkpoint in checkpoints) if path]
     if not found:
         return arguments
     saved = yaml.safe_load(found[-1].read_text())
     return ["--config", yaml.safe_dump({key: saved[key] for key in ("name", "model", "data")}), *arguments]
+
+
+def _is_protocol(value: str) -> bool:
+    """Whether a configuration (a file or its text) or a model's name is about weights under test."""
+    try:
+        content = yaml.safe_load(Path(value).read_text() if value.endswith((".yaml", ".yml")) else value)
+    except (OSError, yaml.YAMLError, UnicodeDecodeError):
+        return False  # the parser will say so
+    model = content.get("model", content) if isinstance(content, dict) else content
+    name = model.get("class_path") if isinstance(model, dict) else model
+    return str(name).rpartition(".")[2] == WeightsUnderTest.__name__
+
+
+def _check_binary(path: Path) -> None:
+    """Say in one line if a file of weights holds text: the parser would take it for the description of a sampler."""
+    starts = {".ckpt": (b"PK", 0), ".safetensors": (b"{", 8)}
+    if path.suffix not in starts or not path.is_file():
+        return
+    mark, at = starts[path.suffix]
+    with path.open("rb") as file:
+        if not file.read(at + len(mark)).endswith(mark):
+            raise StackgenError(f"{path} holds no weights of stackgen, or is damaged")
 
 
 def _check_checkpoint(path: Path) -> None:

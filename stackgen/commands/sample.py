@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from itertools import chain, count
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
 
 from rich.console import Console
 from rich.progress import Progress
@@ -17,9 +19,14 @@ from stackgen.api import DEFAULT, load
 from stackgen.commands import Command, Files
 from stackgen.commands.tables import add_entries, verdict_table
 from stackgen.export import write_glb
+from stackgen.models.sampler_config import SamplerConfig
+from stackgen.protocols import Judge
 from stackgen.render import contact_sheet, save_image
 from stackgen.stack import StackgenError, format_block_list
 from stackgen.stacks_file import StacksFile, write_stacks
+
+if TYPE_CHECKING:
+    from stackgen.verification import Budget
 
 
 def main(
@@ -27,46 +34,87 @@ def main(
     out: Path,
     num_samples: int = 3,
     blocks: str | None = None,
+    inventory: str | None = None,
     seed: int = 0,
     weights: str = DEFAULT,
     block_list_weights: str = DEFAULT,
-) -> None:
-    """Turn silhouettes into stacks of blocks, and let a simulator judge each.
+    sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
+    verify: Judge | None = None,
+    budget: str | None = None,
+) -> int:
+    """Turn silhouettes into stacks of blocks, and let a simulator judge each; with --verify exit code 1 if any falls.
 
     Args:
         images: Pictures of structures.
         out: Folder for stacks.json, stacks.png and a GLB for each stack; with several images, a folder in it for each.
         num_samples: Stacks for each image.
         blocks: Block list, such as cube=3,rectangle=2; chosen by the network by default.
-        seed: Same seed, same stacks.
+        inventory: The blocks there are, such as cube=4,rectangle=3; the block list is chosen from them.
+        seed: Same seed, same stacks, unless --budget is a time.
         weights: Of the sampler: a name, a .safetensors, a .ckpt or the folder of a run.
         block_list_weights: Of the block-list network, likewise.
+        sampler: How a diffusion model samples; what is null is as its weights have it.
+        verify: Draw many stacks, have them judged by the simulator (the default after --verify alone) or by
+            statics, keep the best; with another block list if nothing stands and none was given.
+        budget: What --verify may spend on an image, a time such as 1s or a number of draws for each block list
+            such as 64 (the default).
     """
     if num_samples < 1:
         raise StackgenError(f"--num_samples must be at least 1, got {num_samples}")
+    spent = _budget(verify, budget)
     folders = result_folders(images, out)
-    model = load(weights, block_list_weights)
+    model = load(weights, block_list_weights, sampler)
     # Mistakes come to light before any work is done.
     _ = model.predictor if blocks is None else model.counts(blocks)
+    _ = None if inventory is None else model.inventory(inventory)
     for image in images:
         model.read(image)
-    table, finished = verdict_table("image"), 0
+    asked: dict[str, Any] = {"num_samples": num_samples, "seed": seed, "blocks": blocks, "inventory": inventory}
+    draw: Callable[..., StacksFile] = partial(model.sample_checked, **asked)
+    if verify:
+        draw = partial(model.sample_verified, **asked, verify=verify, budget=spent)
+    results: list[StacksFile] = []
     screen = Console(stderr=True)
     with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
         task = progress.add_task("", total=len(images) * (num_samples + 2))
         try:
             for image, folder in zip(images, folders, strict=True):
                 progress.update(task, description=image.name)
-                result = model.sample_checked(image, num_samples, seed, blocks, lambda: progress.advance(task))
+                result = draw(image, on_step=lambda: progress.advance(task))
                 write_result(result, folder)
                 progress.advance(task)
-                finished += 1
-                add_entries(table, image.name, result.entries, most=1)
+                results.append(result)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(f"{finished} of {len(images)} images are finished in {out}") from None
-    console = Console()
+            raise KeyboardInterrupt(f"{len(results)} of {len(images)} images are finished in {out}") from None
+    return report(results, out, verified=verify is not None)
+
+
+def report(results: Sequence[StacksFile], out: Path, verified: bool) -> int:
+    """Print what became of the images; the exit code is 1 if a stack falls that was said to be verified."""
+    table, console = verdict_table("image"), Console()
+    for result in results:
+        add_entries(table, result.silhouette or "", result.entries, most=1)
     console.print(table)
+    falls = False
+    for result in results if verified else ():
+        console.print(f"{result.silhouette}: {result.comment}", highlight=False)
+        for number, entry in enumerate(result.entries, 1):
+            if entry.verdict is None or not entry.verdict.stable:
+                falls = True
+                why = entry.comment or "the simulator does not agree that it stands"
+                console.print(f"[red]{result.silhouette}: stack {number} falls: {why}[/]", highlight=False)
     console.print(f"wrote {out}", highlight=False)
+    return int(falls)
+
+
+def _budget(verify: Judge | None, budget: str | None) -> Budget | None:
+    if budget is None:
+        return None
+    if verify is None:
+        raise StackgenError("--budget is what --verify may spend: give both, or neither")
+    from stackgen.verification import Budget
+
+    return Budget.parse(budget)
 
 
 def result_folders(images: Sequence[Path], out: Path) -> list[Path]:
@@ -134,6 +182,8 @@ COMMAND = Command(
     """
     stackgen sample examples/silhouettes/arch.png --out out/arch
     stackgen sample sketch.jpg --blocks cube=3,rectangle=2,triangle=1 --num_samples 5 --out out/sketch
+    stackgen sample sketch.jpg --inventory cube=4,rectangle=3 --verify --budget 1s --out out/sketch
+    stackgen sample sketch.jpg --sampler.kind dpm --sampler.steps 8 --out out/sketch
     """,
     files=Files("images", "IMAGE", "Pictures of structures: PNG or JPEG, any size, colours and polarity.", many=True),
 )
@@ -143,4 +193,17 @@ def run(verb: str, argv: Sequence[str]) -> int | None:
     """Run the verb."""
     # A few stacks keep one thread busy; more only wait for each other, and for whoever else uses the machine.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    return COMMAND.run(argv)
+    return COMMAND.run(with_judge(argv))
+
+
+def with_judge(argv: Sequence[str]) -> list[str]:
+    """`--verify` without a judge means the simulator.
+
+    >>> with_judge(["a.png", "--verify", "--budget", "1s"])
+    ['a.png', '--verify', 'simulator', '--budget', '1s']
+    """
+    judges, arguments = get_args(Judge), list(argv)
+    for place in reversed(range(len(arguments))):
+        if arguments[place] == "--verify" and arguments[place + 1 : place + 2] not in [[judge] for judge in judges]:
+            arguments.insert(place + 1, judges[0])
+    return arguments

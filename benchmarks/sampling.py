@@ -1,0 +1,184 @@
+"""Quality against steps, what verified sampling adds, and what both cost, on validation scenes with their true lists.
+
+Three tables: each kind of sampler at some numbers of steps; autoguidance, where a weaker model is named;
+verified sampling with both judges. Stability and front IoU are the simulator's, intervals 95 %, clustered by scene. The
+time is that of one silhouette's samples alone, warm, without the judge for the first two tables.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from rich.progress import track
+
+from benchmarks.common import argument_parser, plain_table, report, start
+from stackgen.models.sampler_config import SamplerConfig
+from stackgen.stack import StackgenError
+
+KINDS = {
+    "ddpm": SamplerConfig("ddpm"),
+    "ddim": SamplerConfig("ddim"),
+    "dpm": SamplerConfig("dpm"),
+    "dpm-sde": SamplerConfig("dpm", eta=1.0),
+}
+TABLES = ("steps", "guidance", "verified")
+METRICS = ("stability", "front_iou", "iou_given_stable", "valid_diversity")
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is measured.
+
+    Args:
+        table, name: Where it stands.
+        sampler: Its settings.
+        verify: The judge, for verified sampling.
+    """
+
+    table: str
+    name: str
+    sampler: SamplerConfig
+    verify: str | None = None
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    options = argument_parser(__name__, __doc__)
+    options.add_argument("--weights", default="default", help="of a diffusion model")
+    options.add_argument("--data", default="data/base.npz", help="dataset with a validation split")
+    options.add_argument("--scenes", type=int, default=150, help="drawn from the validation split")
+    options.add_argument("--num_samples", type=int, default=3, help="of each scene")
+    options.add_argument("--seed", type=int, default=0, help="of scenes and noise")
+    options.add_argument("--tables", nargs="+", choices=TABLES, default=["steps", "verified"], help="what to measure")
+    options.add_argument("--kinds", nargs="+", choices=list(KINDS), default=["ddpm", "ddim", "dpm"], help="of samplers")
+    options.add_argument("--steps", nargs="+", type=int, default=[50, 25, 16, 10, 8, 5, 4], help="calls of the network")
+    options.add_argument("--spacing", type=float, default=None, help="of the steps, see SamplerConfig")
+    options.add_argument("--guide", help="weights of a weaker version of the model, for the table of guidance")
+    options.add_argument("--draws", type=int, default=64, help="of a scene, at most, for verified sampling")
+    options.add_argument("--runs", type=int, default=10, help="timed calls a row")
+    return options
+
+
+def rows_of(options: argparse.Namespace) -> list[Row]:
+    """What the options ask for.
+
+    Raises:
+        StackgenError: If guidance has no guide.
+    """
+    rows = []
+    fast = SamplerConfig("dpm", 8, options.spacing)
+    if "steps" in options.tables:
+        for kind in options.kinds:
+            for steps in options.steps:
+                rows.append(
+                    Row("steps", f"{kind} {steps}", SamplerConfig("ddpm", steps, options.spacing).over(KINDS[kind]))
+                )
+    if "guidance" in options.tables:
+        if options.guide is None:
+            raise StackgenError("the table of guidance needs --guide, weights of a weaker version of the model")
+        for weight in (1.0, 1.25, 1.5, 2.0):
+            for guided in ((0.0, 1.0), (0.3, 1.0)) if weight > 1 else ((0.0, 1.0),):
+                settings = SamplerConfig(guide=options.guide, guidance=weight, guided=guided).over(fast)
+                rows.append(Row("guidance", f"weight {weight}, t/T from {guided[0]}", settings))
+    if "verified" in options.tables:
+        rows.append(Row("verified", "single samples", fast))
+        rows += [Row("verified", judge, fast, judge) for judge in ("statics", "simulator")]
+    return rows
+
+
+def main() -> None:
+    """Measure and print."""
+    options = parser().parse_args()
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `stackgen sample` has it; torch reads it when it is imported
+    rows = rows_of(options)
+    from stackgen.evaluation import load_scenes, physics_of
+    from stackgen.sim.verdict import SimulatorChecker
+    from stackgen.weights import load_sampler
+
+    loaded: Any = load_sampler(options.weights)
+    if not hasattr(loaded, "configured"):
+        raise StackgenError(f"{options.weights} is no diffusion model")
+    scenes, manifest = load_scenes(options.data, "validation")
+    chosen = np.random.default_rng(options.seed).choice(len(scenes), min(options.scenes, len(scenes)), replace=False)
+    scenes = [scenes[i] for i in sorted(chosen)]
+    checker = SimulatorChecker(catalogue=loaded.catalogue, until_fall=True)
+    results = []
+    for row in track(rows, description="sampling and judging"):
+        results.append(measure(row, loaded.configured(row.sampler), scenes, checker, options))
+    figures = {
+        "weights": loaded.card.get("name", options.weights),
+        "weights_sha256": loaded.card.get("sha256"),
+        "dataset": manifest.get("name"),
+        "scenes": len(scenes),
+        "samples_per_scene": options.num_samples,
+        "seed": options.seed,
+        "physics": physics_of(checker),
+        "rows": results,
+    }
+    report("sampling", figures, tables(results, len(scenes), options.num_samples), options.out)
+
+
+def measure(row: Row, sampler: Any, scenes: Sequence[Any], checker: Any, options: argparse.Namespace) -> dict[str, Any]:
+    """Quality and time of a row."""
+    from stackgen.evaluation import evaluate
+    from stackgen.verification import Budget, VerifiedSampler, referee
+
+    if row.verify:
+        judge = referee(row.verify, checker)  # type: ignore[arg-type]
+        sampler = VerifiedSampler(sampler, judge, Budget(options.draws), sampler.grid, row.verify)
+    found = evaluate(sampler, scenes, checker, options.num_samples, options.seed, method=row.name)
+    estimates = {name: found.estimate(name) for name in METRICS}
+
+    def once(number: int) -> Callable[[], object]:
+        scene = scenes[number % len(scenes)]
+        asked = scene.silhouette[None], scene.counts[None], options.num_samples, number
+        return lambda: sampler.sample_batch(*asked)
+
+    once(0)()
+    return {
+        "table": row.table,
+        "name": row.name,
+        "sampler": sampler.settings,
+        "milliseconds": statistics.median(milliseconds(once(i)) for i in range(options.runs)),
+        **{name: estimate and estimate.to_json() for name, estimate in estimates.items()},
+    }
+
+
+def milliseconds(call: Callable[[], object]) -> float:
+    """Wall time of a call."""
+    begin = time.perf_counter()
+    call()
+    return 1000 * (time.perf_counter() - begin)
+
+
+def tables(results: Sequence[dict[str, Any]], scenes: int, samples: int) -> list[Any]:
+    """What is printed."""
+    printed = []
+    for name in TABLES:
+        lines = [
+            [found["name"], *(percent(found[metric]) for metric in METRICS), f"{found['milliseconds']:.0f}"]
+            for found in results
+            if found["table"] == name
+        ]
+        headings = ("", "stability", "front IoU", "IoU if stable", "valid diversity", f"ms for {samples}")
+        if lines:
+            printed.append(plain_table(f"{name}: {scenes} scenes x {samples}, percent", headings, lines))
+    return printed
+
+
+def percent(estimate: dict[str, float] | None) -> str:
+    """A figure with its interval."""
+    if estimate is None:
+        return "-"
+    return f"{100 * estimate['value']:.1f} ({100 * estimate['low']:.0f}-{100 * estimate['high']:.0f})"
+
+
+if __name__ == "__main__":
+    start(main)
