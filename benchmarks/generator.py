@@ -8,6 +8,7 @@ stored stack is put down again. Times are of the process: on a busy machine they
 from __future__ import annotations
 
 import argparse
+import contextlib
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -92,7 +93,7 @@ def main() -> None:
 def made(settings: GenerateSettings, numbers: Sequence[int], what: str) -> tuple[list[list[Stack]], dict[str, float]]:
     """The stored stacks of each template, and what they cost in one process, the writing of the shard included."""
     families: list[list[Sample]] = []
-    with Counting(settings.physics, settings.catalogue) as simulator:
+    with contextlib.closing(Counting(settings.physics, settings.catalogue)) as simulator:
         simulator.rollout(Stack(np.zeros(1, dtype=np.int64), np.array([[0, 0, 0.5, 0, 0, 0]])))  # opens the world
         opened = (simulator.rollouts, simulator.steps, simulator.seconds)
         begin = time.process_time()

@@ -1,25 +1,27 @@
 """Quality against steps, what verified sampling adds, and what both cost, on validation scenes with their true lists.
 
 Three tables: each kind of sampler at some numbers of steps; autoguidance, where a weaker model is named;
-verified sampling with both judges. Stability and front IoU are the simulator's, intervals 95 %, clustered by scene. The
-time is that of one silhouette's samples alone, warm, without the judge for the first two tables.
+verified sampling with both judges. Intervals are 95 %, clustered by scene. The time is that of one silhouette's samples
+alone, warm; of verified sampling with the judge. Each row is printed and written when it is there.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
-from rich.progress import track
 
 from benchmarks.common import argument_parser, plain_table, report, start
+from stackgen.files import write_atomically
 from stackgen.models.sampler_config import SamplerConfig
+from stackgen.protocols import Judge
 from stackgen.stack import StackgenError
 
 KINDS = {
@@ -45,7 +47,7 @@ class Row:
     table: str
     name: str
     sampler: SamplerConfig
-    verify: str | None = None
+    verify: Judge | None = None
 
 
 def parser() -> argparse.ArgumentParser:
@@ -61,6 +63,7 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--steps", nargs="+", type=int, default=[50, 25, 16, 10, 8, 5, 4], help="calls of the network")
     options.add_argument("--spacing", type=float, default=None, help="of the steps, see SamplerConfig")
     options.add_argument("--guide", help="weights of a weaker version of the model, for the table of guidance")
+    options.add_argument("--judge", choices=("simulator", "statics"), default="simulator", help="of the figures")
     options.add_argument("--draws", type=int, default=64, help="of a scene, at most, for verified sampling")
     options.add_argument("--runs", type=int, default=10, help="timed calls a row")
     return options
@@ -89,7 +92,7 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
                 rows.append(Row("guidance", f"weight {weight}, t/T from {guided[0]}", settings))
     if "verified" in options.tables:
         rows.append(Row("verified", "single samples", fast))
-        rows += [Row("verified", judge, fast, judge) for judge in ("statics", "simulator")]
+        rows += [Row("verified", judge, fast, judge) for judge in get_args(Judge)]
     return rows
 
 
@@ -109,20 +112,26 @@ def main() -> None:
     chosen = np.random.default_rng(options.seed).choice(len(scenes), min(options.scenes, len(scenes)), replace=False)
     scenes = [scenes[i] for i in sorted(chosen)]
     checker = SimulatorChecker(catalogue=loaded.catalogue, until_fall=True)
-    results = []
-    for row in track(rows, description="sampling and judging"):
-        results.append(measure(row, loaded.configured(row.sampler), scenes, checker, options))
-    figures = {
+    figures: dict[str, Any] = {
         "weights": loaded.card.get("name", options.weights),
         "weights_sha256": loaded.card.get("sha256"),
         "dataset": manifest.get("name"),
         "scenes": len(scenes),
         "samples_per_scene": options.num_samples,
         "seed": options.seed,
+        "judge": options.judge,
         "physics": physics_of(checker),
-        "rows": results,
+        "rows": [],
     }
-    report("sampling", figures, tables(results, len(scenes), options.num_samples), options.out)
+    for number, row in enumerate(rows, 1):
+        found = measure(row, loaded.configured(row.sampler), scenes, checker, options)
+        figures["rows"].append(found)
+        line = ", ".join(f"{name} {percent(found[name])}" for name in METRICS)
+        print(f"{number}/{len(rows)} {row.table}: {row.name}: {line}, {found['milliseconds']:.0f} ms", flush=True)
+        if options.out is not None:
+            options.out.parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(options.out, (json.dumps(figures, indent=1) + "\n").encode())
+    report("sampling", figures, tables(figures["rows"], len(scenes), options.num_samples), options.out)
 
 
 def measure(row: Row, sampler: Any, scenes: Sequence[Any], checker: Any, options: argparse.Namespace) -> dict[str, Any]:
@@ -130,10 +139,12 @@ def measure(row: Row, sampler: Any, scenes: Sequence[Any], checker: Any, options
     from stackgen.evaluation import evaluate
     from stackgen.verification import Budget, VerifiedSampler, referee
 
-    if row.verify:
-        judge = referee(row.verify, checker)  # type: ignore[arg-type]
+    if row.verify is not None:
+        judge = referee(row.verify, checker)
         sampler = VerifiedSampler(sampler, judge, Budget(options.draws), sampler.grid, row.verify)
-    found = evaluate(sampler, scenes, checker, options.num_samples, options.seed, method=row.name)
+    found = evaluate(
+        sampler, scenes, referee(options.judge, checker), options.num_samples, options.seed, method=row.name
+    )
     estimates = {name: found.estimate(name) for name in METRICS}
 
     def once(number: int) -> Callable[[], object]:

@@ -36,7 +36,7 @@ from stackgen.stack import Catalogue, StackgenError
 
 FORMAT = "stackgen.weights/1"
 FOLDER = Path(__file__).parent / "assets" / "weights"
-DEFAULTS = {"sampler": "ddpm-small", "predictor": "blocklist-small"}
+DEFAULTS = {"sampler": "ddpm-verdicts", "predictor": "blocklist-small"}
 """What the name `default` stands for."""
 
 _CHECKPOINT_CARD = "stackgen"  # stackgen.models.world.CHECKPOINT_KEY, which this module must not import Lightning for

@@ -11,9 +11,7 @@ import io
 import json
 import math
 import os
-import sys
 import zipfile
-from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -25,6 +23,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from stackgen.data.buffers import Buffers
 from stackgen.data.decoding import PADDING, Decoded, Frame
 from stackgen.data.losses import Losses, decode_sound
 from stackgen.data.shards import SPLITS, Sample
@@ -169,36 +168,6 @@ _BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)
 _PIXELS = torch.from_numpy(_BITS.astype(np.float32))
 _REVERSED = torch.from_numpy(np.packbits(_BITS[:, ::-1], axis=1)[:, 0])  # the bits of each byte from behind
 _MIRROR = torch.tensor([-1.0, 1.0, 1.0, 1.0, -1.0, -1.0])
-
-
-class Buffers:
-    """Memory for float pictures on the CPU, used again once nobody holds what was made of it.
-
-    64 MB a batch of 4096: to ask the system for them anew costs more than to fill them.
-
-    Args:
-        most: Buffers kept; whoever holds more batches than this gets fresh memory.
-    """
-
-    def __init__(self, most: int = 4) -> None:
-        self._most = most
-        self._kept: deque[NDArray[np.float32]] = deque()
-
-    def take(self, size: int) -> Tensor:
-        """(size,) float32 of any content."""
-        for _ in range(len(self._kept)):
-            buffer = self._kept.popleft()
-            free = sys.getrefcount(buffer) == 2  # by this name and as the argument; a tensor's storage is a third
-            if free and len(buffer) < size:
-                continue  # too small by now: let it go
-            self._kept.append(buffer)
-            if free:
-                return torch.from_numpy(buffer[:size])
-        # numpy asks for huge pages: half the time of torch's fresh memory
-        buffer = np.empty(size, np.float32)
-        if len(self._kept) < self._most:
-            self._kept.append(buffer)
-        return torch.from_numpy(buffer[:size])
 
 
 @dataclass(frozen=True)
@@ -367,24 +336,37 @@ def load_dataset(path: str | Path, splits: Iterable[str] = SPLITS) -> tuple[dict
 
 def _fill(shards: Sequence[Shard], frame: Frame, losses: Losses) -> StackArrays:
     """All samples of some shards; damage to one is an error, since it is found before anything was begun."""
-    parts = []
+    total, count = sum(shard.samples for shard in shards), 0
+    # Not in parts that are then put together: that would take twice the memory.
+    fields: dict[str, NDArray[Any]] = {
+        "shapes": np.empty((total, frame.max_blocks), np.uint8),
+        "poses": np.empty((total, frame.max_blocks, 6), np.float32),
+        "silhouettes": np.empty((total, frame.image_size**2 // 8), np.uint8),
+        "template": np.empty(total, np.int64),
+    }
     for shard in _tracked(shards):
         decoded, lost = decode_sound(shard.read(), shard, frame)
         losses.add(lost)
-        parts.append(StackArrays.of(decoded, frame))
-    arrays = StackArrays.concatenate(parts)
-    if not len(arrays):
+        stop = count + len(decoded.positions)
+        if stop > total:
+            raise StackgenError(f"shard {shard.path} holds more samples than dataset.json says")
+        for name, column in fields.items():
+            column[count:stop] = getattr(decoded, name)
+        count = stop
+    if not count:
         raise StackgenError("dataset: the shards hold no sample")
-    return arrays
+    return StackArrays(**{name: column[:count] for name, column in fields.items()}, num_shapes=frame.num_shapes)
 
 
 def _tracked(shards: Sequence[Shard]) -> Iterable[Shard]:
     """The shards, with a progress bar if reading them takes a while."""
     if sum(shard.samples for shard in shards) < LONG and not is_remote(shards[0].path):
         return shards
-    from rich.progress import track  # only where it is needed
+    from rich.console import Console  # only where it is needed
+    from rich.progress import track
 
-    return track(shards, "reading shards", transient=True)
+    screen = Console(stderr=True)
+    return track(shards, "reading shards", console=screen, transient=True, disable=not screen.is_terminal)
 
 
 def _one_line(error: Exception) -> str:

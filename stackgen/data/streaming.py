@@ -19,7 +19,8 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader, IterableDataset, get_worker_info
 
-from stackgen.data.arrays import Batch, Buffers, StackArrays, StackTensors
+from stackgen.data.arrays import Batch, StackArrays, StackTensors
+from stackgen.data.buffers import Buffers
 from stackgen.data.decoding import Decoded, Frame
 from stackgen.data.epochs import Epochs
 from stackgen.data.losses import Loss, Losses, read_decoded

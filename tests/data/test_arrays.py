@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from stackgen.data.arrays import Buffers, StackArrays, load_dataset, load_npz, save_npz
+from stackgen.data.arrays import StackArrays, load_dataset, load_npz, save_npz
+from stackgen.data.buffers import Buffers
 from stackgen.data.decoding import Frame, decode_shard
 from stackgen.data.shards import Sample, encode_shard, read_shard
 from stackgen.geometry import mirror, silhouette

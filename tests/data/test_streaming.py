@@ -370,3 +370,17 @@ def test_a_shard_that_holds_fewer_samples_than_the_manifest_says_is_reported(
     with said() as lines:
         assert len(templates(ExactStream(folder, "validation", 8))) == 20
     assert lines[-1] == "data: samples skipped in the validation split: 3"
+    with said() as lines:
+        assert len(load_dataset(folder, ("validation",))[0]["validation"]) == 20
+    assert lines == [
+        "data: validation-000002.tar lacks 3 of the samples that dataset.json says it has",
+        f"data: samples skipped in {folder}: 3",
+    ]
+
+
+def test_a_shard_that_holds_more_samples_than_the_manifest_says_is_refused(dataset: Path, tmp_path: Path) -> None:
+    folder = copy_of(dataset, tmp_path / "long")
+    manifest = Manifest.load(folder)
+    replace(manifest, shards=tuple({**entry, "samples": 20} for entry in manifest.shards)).save(folder)
+    with pytest.raises(StackgenError, match=r"validation-000002\.tar holds more samples than dataset\.json says"):
+        load_dataset(folder, ("validation",))
