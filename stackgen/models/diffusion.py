@@ -200,8 +200,10 @@ class PoseDiffusion(nn.Module):
         weight = config.guidance
 
         def predict(x: Tensor, t: Tensor) -> Tensor:
-            ours, theirs = strong(x, t), weak(x, t)
-            return self._bounded(theirs + weight * (ours - theirs)) if first <= int(t) <= last else ours
+            if not first <= int(t) <= last:
+                return strong(x, t)
+            theirs = weak(x, t)
+            return self._bounded(theirs + weight * (strong(x, t) - theirs)) if weight else theirs
 
         return predict
 

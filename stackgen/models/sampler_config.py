@@ -29,7 +29,7 @@ class SamplerConfig:
         variance: Of the noise of `ddpm`: `beta` (paper) or `posterior`, see samplers.ancestral.
         guide: Weights of a weaker version of the model, for autoguidance (Karras et al. 2024): the estimate is
             weak + guidance (strong - weak).
-        guidance: Its weight; 1 is none.
+        guidance: Its weight; 1 is none, 0 leaves the weaker model alone to act there.
         guided: Where it acts, as shares of T: from which to which t.
 
     Raises:
@@ -54,8 +54,8 @@ class SamplerConfig:
             raise StackgenError(f"sampler.spacing must lie in 1..10, got {self.spacing}")
         if self.eta is not None and not 0 <= self.eta <= 1:
             raise StackgenError(f"sampler.eta must lie in 0..1, got {self.eta}")
-        if self.guidance is not None and not 0 < self.guidance <= 100:
-            raise StackgenError(f"sampler.guidance must be positive, at most 100, got {self.guidance}")
+        if self.guidance is not None and not 0 <= self.guidance <= 100:
+            raise StackgenError(f"sampler.guidance must lie in 0..100, got {self.guidance}")
         if self.guided is not None and not 0 <= self.guided[0] < self.guided[1] <= 1:
             raise StackgenError(f"sampler.guided must be two shares of T, such as [0.3, 1], got {list(self.guided)}")
 

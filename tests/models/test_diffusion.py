@@ -314,7 +314,7 @@ def test_what_the_card_says_of_sampling_holds_unless_overridden() -> None:
         ({"kind": "dpm", "eta": 1.5}, "0..1"),
         ({"spacing": 0.5}, "1..10"),
         ({"guidance": 2.0}, "sampler.guide"),
-        ({"guidance": -1.0}, "positive"),
+        ({"guidance": -1.0}, "must lie in"),
         ({"guided": [0.5, 0.2]}, "two shares"),
         ({"guide": "no-such-weights"}, "no-such-weights"),
         ({"guide": "default"}, "another|no diffusion model of the same"),
