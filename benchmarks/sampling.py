@@ -76,13 +76,12 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
         StackgenError: If guidance has no guide.
     """
     rows = []
-    fast = SamplerConfig("dpm", 8, options.spacing)
+    fast = SamplerConfig("ddpm", 8, options.spacing)
     if "steps" in options.tables:
         for kind in options.kinds:
             for steps in options.steps:
-                rows.append(
-                    Row("steps", f"{kind} {steps}", SamplerConfig("ddpm", steps, options.spacing).over(KINDS[kind]))
-                )
+                settings = KINDS[kind].over(SamplerConfig(steps=steps, spacing=options.spacing))
+                rows.append(Row("steps", f"{kind} {steps}", settings))
     if "guidance" in options.tables:
         if options.guide is None:
             raise StackgenError("the table of guidance needs --guide, weights of a weaker version of the model")

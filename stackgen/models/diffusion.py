@@ -154,13 +154,12 @@ class PoseDiffusion(nn.Module):
             generator: Of all noise.
             callback: Told (t, poses [cell, rad]) before each step and (0, poses) at the end.
             sampler: The way from noise to poses.
-            guide: The weaker version of this model that `sampler` asks for.
+            guide: The other version of this model that `sampler` asks for.
         """
         config = self.complete(sampler)
         predict = self._predictor(silhouettes, shapes, mask)
         if guide is not None:
-            weak = guide._predictor(silhouettes, shapes, mask)
-            predict = self._guided(predict, weak, config)
+            predict = self._guided(predict, guide._predictor(silhouettes, shapes, mask), config)
         shown = None if callback is None else (lambda t, x: callback(t, x * self.std + self.mean))
         noise = torch.randn((*shapes.shape, POSE), generator=generator, device=generator.device).to(shapes.device)
         assert config.steps and config.spacing
@@ -193,17 +192,17 @@ class PoseDiffusion(nn.Module):
 
         return predict
 
-    def _guided(self, strong: Predict, weak: Predict, config: SamplerConfig) -> Predict:
-        """Autoguidance (Karras et al. 2024): away from what a weaker version of the model would do."""
+    def _guided(self, own: Predict, other: Predict, config: SamplerConfig) -> Predict:
+        """Away from what a weaker version of the model would do (autoguidance, Karras et al. 2024), or towards it."""
         assert config.guided is not None and config.guidance is not None
         first, last = (share * self.schedule.steps for share in config.guided)
         weight = config.guidance
 
         def predict(x: Tensor, t: Tensor) -> Tensor:
             if not first <= int(t) <= last:
-                return strong(x, t)
-            theirs = weak(x, t)
-            return self._bounded(theirs + weight * (strong(x, t) - theirs)) if weight else theirs
+                return own(x, t)
+            theirs = other(x, t)
+            return self._bounded(theirs + weight * (own(x, t) - theirs)) if weight else theirs
 
         return predict
 

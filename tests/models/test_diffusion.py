@@ -334,13 +334,13 @@ def samples_of(model: PoseDiffusion, batch: dict[str, Tensor], guide: PoseDiffus
 
 
 def test_guidance_moves_away_from_the_weaker_model(batch: dict[str, Tensor]) -> None:
-    """Where the weak model is off by delta, the guided estimate is off by (1 - weight) delta."""
+    """Where the weak model is off by delta, the guided estimate is off by (1 - weight) delta; below 1 towards it."""
     strong, weak = model_for("v"), model_for("v")
     batch = {**batch, "poses": torch.where(batch["mask"][..., None], batch["poses"], strong.mean)}
     clean, delta = normalised(strong, batch), 0.2
     strong.denoiser = Oracle(strong, clean)  # type: ignore[assignment]
     weak.denoiser = Oracle(weak, clean, delta)  # type: ignore[assignment]
-    for weight in (1.0, 1.5, 3.0):
+    for weight in (0.0, 0.5, 1.0, 1.5, 3.0):
         found = samples_of(strong, batch, weak, guidance=weight)
         expected = (clean + (1 - weight) * delta) * strong.std + strong.mean
         assert found == pytest.approx(expected, abs=5e-3)
