@@ -1,0 +1,257 @@
+"""How every method degrades on silhouettes that the generator cannot have made.
+
+Scenes of testset-v1, evenly spread, each disturbed in several ways and asked for as `stackgen sample` asks: with the
+CNN's block list, the silhouette shifted to the grid's cells. Front IoU is with the disturbed silhouette. Intervals are
+95 %, clustered by scene. Each row is printed and written when it is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import ndimage
+
+from benchmarks.common import argument_parser, plain_table, report, start
+from stackgen.aligned import AlignedSampler
+from stackgen.files import write_atomically
+from stackgen.geometry import PAPER_GRID, Grid, Mask, silhouette
+from stackgen.images import grid_offset
+from stackgen.protocols import StabilityChecker, StackSampler
+from stackgen.stack import Stack, StackgenError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from stackgen.evaluation import Scene
+    from stackgen.protocols import BlockListPredictor
+
+METRICS = ("stability", "front_iou", "iou_given_stable")
+DRAWINGS = Path("examples/silhouettes")
+
+Disturb = Callable[[Mask, np.random.Generator], Mask]
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    options = argument_parser(__name__, __doc__)
+    names = ["brute-force", "greedy-random", "default"]
+    options.add_argument("--weights", nargs="+", default=names, help="methods: names, files of weights or run folders")
+    options.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS), help="of silhouettes")
+    options.add_argument("--scenes", type=int, default=50, help="how many, evenly spread over the test set")
+    options.add_argument("--num_samples", type=int, default=3, help="of each scene")
+    options.add_argument("--verified", action="store_true", help="add verified sampling with the last of the weights")
+    options.add_argument("--draws", type=int, default=64, help="of a scene, at most, for verified sampling")
+    options.add_argument("--seed", type=int, default=0, help="of disturbances and noise")
+    return options
+
+
+def shifted(cells: float) -> Disturb:
+    """Moved sideways, to the side that has more room."""
+
+    def disturb(mask: Mask, rng: np.random.Generator) -> Mask:
+        columns = np.flatnonzero(mask.any(axis=0))
+        side = 1 if columns[0] < mask.shape[1] - 1 - columns[-1] else -1
+        return np.roll(mask, side * round(cells * PAPER_GRID.pixels_per_cell), axis=1)
+
+    return disturb
+
+
+def warped(matrix: Callable[[float], NDArray[np.float64]], amount: float) -> Disturb:
+    """Linearly, about the middle of the ground line, to either side; then set down on the ground line."""
+
+    def disturb(mask: Mask, rng: np.random.Generator) -> Mask:
+        side = rng.choice([-1.0, 1.0]) if amount < 45 else 1.0
+        inverse = np.linalg.inv(matrix(side * amount))  # in (row, column)
+        foot = np.array([PAPER_GRID.image_size - PAPER_GRID.ground_margin, PAPER_GRID.image_size / 2]) - 0.5
+        turned = ndimage.affine_transform(mask.astype(float), inverse, foot - inverse @ foot, order=1) >= 0.5
+        return on_ground(turned)
+
+    return disturb
+
+
+def rotation(degrees: float) -> NDArray[np.float64]:
+    """(2, 2) in (row, column)."""
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return np.array([[c, s], [-s, c]])
+
+
+def shear(degrees: float) -> NDArray[np.float64]:
+    """(2, 2) in (row, column): upright edges lean, level ones stay."""
+    return np.array([[1.0, 0.0], [np.tan(np.radians(degrees)), 1.0]])
+
+
+def scaling(percent: float) -> NDArray[np.float64]:
+    """(2, 2) to this size."""
+    return np.eye(2) * percent / 100
+
+
+def on_ground(mask: Mask) -> Mask:
+    """The mask, moved down or up until it touches the ground line."""
+    rows = np.flatnonzero(mask.any(axis=1))
+    foot = round(PAPER_GRID.image_size - PAPER_GRID.ground_margin) - 1
+    return np.roll(mask, foot - rows[-1], axis=0) if len(rows) else mask
+
+
+def rough(mask: Mask, rng: np.random.Generator) -> Mask:
+    """Of the pixels on either side of an edge 30 % change; specks go."""
+    edge = ndimage.binary_dilation(mask) & ~ndimage.binary_erosion(mask)
+    noisy = mask ^ (edge & (rng.random(mask.shape) < 0.3))
+    labels, _ = ndimage.label(noisy)
+    return labels == np.bincount(labels[noisy]).argmax() if noisy.any() else mask
+
+
+def drawn_by_hand(mask: Mask, rng: np.random.Generator) -> Mask:
+    """Edges that waver by a pixel or two over the length of a block, as a hand draws them."""
+    offsets = [ndimage.gaussian_filter(rng.normal(size=mask.shape), 5.0) for _ in range(2)]
+    places = [
+        place + 1.5 * offset / offset.std() for place, offset in zip(np.indices(mask.shape), offsets, strict=True)
+    ]
+    return on_ground(ndimage.map_coordinates(mask.astype(float), places, order=1) >= 0.5)
+
+
+DISTURBANCES: dict[str, Disturb] = {
+    "as it is": lambda mask, rng: mask,
+    "shifted by 1/4 cell": shifted(0.25),
+    "shifted by 1/2 cell": shifted(0.5),
+    "turned by 2 degrees": warped(rotation, 2.0),
+    "turned by 5 degrees": warped(rotation, 5.0),
+    "slanted by 5 degrees": warped(shear, 5.0),
+    "slanted by 10 degrees": warped(shear, 10.0),
+    "scaled to 90 %": warped(scaling, 90.0),
+    "rough edges": rough,
+    "drawn by hand": drawn_by_hand,
+}
+HALF_CELLS, EXAMPLES = "half-cell steps", "drawings"
+KINDS = (*DISTURBANCES, HALF_CELLS, EXAMPLES)
+
+
+def half_cell_steps(truth: Stack, checker: StabilityChecker, rng: np.random.Generator) -> Stack | None:
+    """The stack with all above some level moved by half a cell, if there is such a one that stands."""
+    levels = np.unique(np.round(truth.poses[:, 2] - 0.5).astype(int))
+    for level in rng.permutation(levels[levels > 0]):
+        for side in rng.permutation([-0.5, 0.5]):
+            poses = truth.poses.copy()
+            poses[np.round(poses[:, 2] - 0.5) >= level, 0] += side
+            verdict = checker.check(truth.with_poses(poses))
+            if verdict.stable and verdict.at_rest:
+                return verdict.settled
+    return None
+
+
+def scenes_of_kind(kind: str, scenes: Sequence[Scene], checker: StabilityChecker, seed: int) -> list[Scene]:
+    """What is asked for: fewer scenes where a disturbance has no sense."""
+    from dataclasses import replace
+
+    from stackgen.evaluation import Scene
+    from stackgen.images import read_silhouette
+
+    if kind == EXAMPLES:
+        files = sorted(DRAWINGS.glob("*.png"))
+        unknown = np.zeros_like(scenes[0].counts)
+        return [Scene(file.stem, read_silhouette(file), unknown) for file in files]
+    found = []
+    for number, scene in enumerate(scenes):
+        rng = np.random.default_rng([seed, KINDS.index(kind), number])
+        if kind == HALF_CELLS:
+            moved = half_cell_steps(scene.truth, checker, rng) if scene.truth else None
+            if moved is not None:
+                found.append(Scene(scene.name, silhouette(moved), scene.counts, moved))
+        else:
+            found.append(replace(scene, silhouette=DISTURBANCES[kind](scene.silhouette, rng), truth=None))
+    return found
+
+
+class AlignedPredictor:
+    """A BlockListPredictor that shows another each structure on the cells of its grid.
+
+    Args:
+        predictor: The other.
+        grid: Scale of the silhouettes.
+    """
+
+    def __init__(self, predictor: BlockListPredictor, grid: Grid = PAPER_GRID) -> None:
+        self.predictor, self.grid = predictor, grid
+
+    def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
+        """See BlockListPredictor."""
+        shifted = [np.roll(mask, grid_offset(mask, self.grid), axis=1) for mask in silhouettes]
+        return self.predictor.predict(np.stack(shifted), top, limit)
+
+
+def methods_of(options: argparse.Namespace, checker: StabilityChecker) -> dict[str, StackSampler]:
+    """Whom to ask, by name."""
+    from stackgen.runs import resolve_weights
+    from stackgen.verification import Budget, VerifiedSampler
+    from stackgen.weights import load_sampler
+
+    methods: dict[str, StackSampler] = {}
+    for name in options.weights:
+        sampler = load_sampler(resolve_weights(name))
+        title = getattr(sampler, "card", {}).get("name", name)
+        methods[title] = AlignedSampler(sampler)
+    if options.verified:
+        methods[f"{title}, verified"] = VerifiedSampler(methods[title], checker, Budget(options.draws))
+    return methods
+
+
+def main() -> None:
+    """Disturb, ask, judge."""
+    options = parser().parse_args()
+    if min(options.scenes, options.num_samples) < 1:
+        raise StackgenError("--scenes and --num_samples must be at least 1")
+    from stackgen.data.generation.generate import TESTSET
+    from stackgen.data.shards import manifest_sha256
+    from stackgen.evaluation import evaluate, load_scenes, physics_of
+    from stackgen.sim.verdict import SimulatorChecker
+    from stackgen.weights import load_predictor
+
+    everything, manifest = load_scenes(TESTSET)
+    number = min(options.scenes, len(everything))
+    scenes = [everything[i] for i in np.linspace(0, len(everything) - 1, number).round().astype(int)]
+    checker, predictor = SimulatorChecker(until_fall=True), AlignedPredictor(load_predictor("default"))
+    methods = methods_of(options, checker)
+    rows: list[dict[str, Any]] = []
+    figures = {
+        "test_set": manifest_sha256(manifest),
+        "samples_per_scene": options.num_samples,
+        "seed": options.seed,
+        "physics": physics_of(checker),
+        "rows": rows,
+    }
+    for kind in options.kinds:
+        asked = scenes_of_kind(kind, scenes, checker, options.seed)
+        for name, sampler in methods.items():
+            found = evaluate(sampler, asked, checker, options.num_samples, options.seed, predictor)
+            estimates = {metric: found.estimate(metric) for metric in METRICS}
+            rows.append({"silhouettes": kind, "scenes": len(asked), "method": name}
+                        | {metric: value and value.to_json() for metric, value in estimates.items()})  # fmt: skip
+            print(f"{kind}, {name}: " + ", ".join(f"{m} {_percent(rows[-1][m])}" for m in METRICS), flush=True)
+            if options.out is not None:
+                options.out.parent.mkdir(parents=True, exist_ok=True)
+                write_atomically(options.out, (json.dumps(figures, indent=1) + "\n").encode())
+    report("out_of_distribution", figures, [table(rows, metric) for metric in METRICS[:2]], options.out)
+
+
+def table(rows: Sequence[Mapping[str, Any]], metric: str) -> Any:
+    """One metric: silhouettes down, methods across."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    lines: dict[str, list[str]] = {}
+    for row in rows:
+        lines.setdefault(f"{row['silhouettes']} ({row['scenes']})", []).append(_percent(row[metric]))
+    title = f"{metric.replace('_', ' ')}, percent"
+    return plain_table(title, ("silhouettes (scenes)", *methods), [[name, *line] for name, line in lines.items()])
+
+
+def _percent(estimate: Mapping[str, float] | None) -> str:
+    if estimate is None:
+        return "-"
+    return f"{100 * estimate['value']:.1f} ({100 * estimate['low']:.0f}-{100 * estimate['high']:.0f})"
+
+
+if __name__ == "__main__":
+    start(main)
