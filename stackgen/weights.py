@@ -124,8 +124,16 @@ def write_weights(path: Path, tensors: dict[str, Tensor], card: dict[str, Any]) 
     write_atomically(path.with_suffix(".json"), (json.dumps(full, indent=1) + "\n").encode())
 
 
-def export_checkpoint(checkpoint: Path, out: Path, metrics: dict[str, Any] | None = None) -> dict[str, Any]:
+def export_checkpoint(
+    checkpoint: Path, out: Path, metrics: dict[str, Any] | None = None, half: bool = False
+) -> dict[str, Any]:
     """Write a checkpoint's weights (the averaged ones, where EMA ran) as safetensors with a card; returns the card.
+
+    Args:
+        checkpoint: Of a training.
+        out: The .safetensors file; the card goes beside it.
+        metrics: To be quoted in the card.
+        half: Store matrices as 16-bit floats: half the size, computed with as 32-bit ones.
 
     Raises:
         StackgenError: If the checkpoint is not ours, or `out` is not a `.safetensors` path.
@@ -135,6 +143,8 @@ def export_checkpoint(checkpoint: Path, out: Path, metrics: dict[str, Any] | Non
     tensors, card = _read_checkpoint(checkpoint)
     if metrics:
         card["metrics"] = metrics
+    if half:  # vectors, schedules among them, are small and may need every digit
+        tensors = {k: v.half() if v.is_floating_point() and v.ndim > 1 else v for k, v in tensors.items()}
     write_weights(out, tensors, card)
     return card
 

@@ -83,6 +83,18 @@ def test_a_checkpoint_and_its_export_are_the_same_weights(tiny: TinyWeights, tmp
     load_sampler(tmp_path / "out.safetensors")
 
 
+def test_half_the_size_is_nearly_the_same_network(tiny: TinyWeights, tmp_path: Path) -> None:
+    source = checkpoint(tmp_path / "run.ckpt", tiny)
+    export_checkpoint(source, tmp_path / "whole.safetensors")
+    export_checkpoint(source, tmp_path / "half.safetensors", half=True)
+    assert (tmp_path / "half.safetensors").stat().st_size < 0.7 * (tmp_path / "whole.safetensors").stat().st_size
+    whole, half = (read_weights(tmp_path / f"{name}.safetensors")[0] for name in ("whole", "half"))
+    assert all(torch.equal(whole[k], half[k]) for k in whole if whole[k].ndim < 2)
+    assert all(torch.allclose(whole[k], half[k].float(), rtol=1e-3, atol=1e-4) for k in whole if whole[k].ndim > 1)
+    network: Any = load_sampler(tmp_path / "half.safetensors")
+    assert {tensor.dtype for tensor in network.model.parameters()} == {torch.float32}
+
+
 def test_names_are_found_in_the_package(copies: TinyWeights, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "FOLDER", copies.sampler.parent)
     monkeypatch.setattr(module, "DEFAULTS", {"sampler": "ddpm", "predictor": "cnn"})

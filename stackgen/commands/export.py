@@ -9,16 +9,17 @@ from stackgen.commands import Command, Files
 from stackgen.runs import resolve_weights
 
 
-def main(checkpoint: Path, out: Path) -> None:
+def main(checkpoint: Path, out: Path, half: bool = False) -> None:
     """Write the weights of a checkpoint as safetensors, with a JSON card beside them.
 
     Args:
         checkpoint: Of `stackgen fit`.
         out: File to write, ending in .safetensors; the card gets the same name and .json.
+        half: Store matrices as 16-bit floats: half the size.
     """
     from stackgen.weights import export_checkpoint
 
-    export_checkpoint(Path(resolve_weights(checkpoint)), out)
+    export_checkpoint(Path(resolve_weights(checkpoint)), out, half=half)
     print(f"wrote {out}\nwrote {out.with_suffix('.json')}")
 
 
@@ -28,6 +29,7 @@ COMMAND = Command(
     """
     stackgen export runs/ddpm-small/version_0/checkpoints/last.ckpt --out ddpm-small.safetensors
     stackgen export runs/ddpm-small --out ddpm-small.safetensors
+    stackgen export runs/tran-reg --out tran-reg.safetensors --half
     """,
     files=Files("checkpoint", "CHECKPOINT", "A .ckpt of `stackgen fit`, or the folder of a run."),
 )
