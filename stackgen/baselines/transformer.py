@@ -31,7 +31,7 @@ from stackgen.models.denoiser import (
     raster_order,
     sinusoids,
 )
-from stackgen.models.diffusion import pad_shapes
+from stackgen.models.network_sampler import NetworkSampler
 from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Stack, StackgenError
 
 _FORBIDDEN = 1e6  # cost of giving a block another shape's pose
@@ -172,8 +172,8 @@ class PoseNetwork(nn.Module):
 
     @property
     def trims(self) -> bool:
-        """Whether padding may be left out: not where the network was trained to see it."""
-        return self.transformer.conditioning == "cross" or self.transformer.mask_padding
+        """See DenoiserConfig."""
+        return self.transformer.trims
 
     def fit_normalization(self, mean: ArrayLike, std: ArrayLike) -> None:
         """Take over the training poses' statistics (6,) [cell, rad]."""
@@ -249,15 +249,8 @@ def best_match(cost: Tensor, shapes: Tensor) -> Tensor:
     return torch.from_numpy(found).to(shapes.device)
 
 
-class TransformerSampler:
-    """A StackSampler: a learned baseline with its world.
-
-    Args:
-        model: Trained.
-        catalogue, grid, max_blocks: The world it was trained in.
-        card: What is known about the weights.
-        batch: Stacks estimated together, at most.
-    """
+class TransformerSampler(NetworkSampler):
+    """A StackSampler: a learned baseline with its world; arguments as :class:`NetworkSampler` has them."""
 
     def __init__(
         self,
@@ -269,9 +262,7 @@ class TransformerSampler:
         batch: int = 512,
     ) -> None:
         self.model = model.eval()
-        self.catalogue, self.grid, self.max_blocks = catalogue, grid, max_blocks
-        self.card = card or {}
-        self.batch = batch
+        super().__init__(self.model, catalogue, grid, max_blocks, card, batch)
 
     def sample_batch(
         self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
@@ -281,37 +272,4 @@ class TransformerSampler:
         Raises:
             StackgenError: If a block list is empty or longer than the model takes, or sizes differ.
         """
-        self._check(silhouettes, counts, num_samples)
-        stacks: list[list[Stack]] = []
-        scenes = max(1, self.batch // num_samples)
-        generator = torch.Generator().manual_seed(seed)
-        for start in range(0, len(counts), scenes):
-            part = slice(start, start + scenes)
-            stacks += self._sample(silhouettes[part], np.asarray(counts[part]), num_samples, generator)
-        return stacks
-
-    def _check(self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int) -> None:
-        if num_samples < 1:
-            raise StackgenError(f"the number of samples must be at least 1, got {num_samples}")
-        size = self.grid.image_size
-        if silhouettes.ndim != 3 or silhouettes.shape[1:] != (size, size) or len(counts) != len(silhouettes):
-            raise StackgenError(f"sampling needs silhouettes (B, {size}, {size}) and as many block lists")
-        totals = np.asarray(counts).sum(axis=1)
-        if len(totals) and not (totals.min() >= 1 and totals.max() <= self.max_blocks):
-            raise StackgenError(f"this model takes 1 to {self.max_blocks} blocks, got {sorted(set(totals.tolist()))}")
-
-    def _sample(
-        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, generator: torch.Generator
-    ) -> list[list[Stack]]:
-        device = self.model.mean.device
-        longest = int(counts.sum(axis=1).max()) if self.model.trims else self.max_blocks
-        shapes, mask = pad_shapes(counts, longest)
-        poses = self.model.sample(
-            torch.from_numpy(np.ascontiguousarray(silhouettes, dtype=np.float32)).to(device),
-            torch.from_numpy(np.repeat(shapes, num_samples, axis=0)).to(device),
-            torch.from_numpy(np.repeat(mask, num_samples, axis=0)).to(device),
-            generator,
-        )
-        found = poses.double().cpu().numpy().reshape(len(shapes), num_samples, -1, POSE)
-        kinds = [row[real] for row, real in zip(shapes, mask, strict=True)]
-        return [[Stack(k, p[: len(k)], self.catalogue) for p in rows] for k, rows in zip(kinds, found, strict=True)]
+        return self._answer(silhouettes, counts, num_samples, seed, self.model.sample)

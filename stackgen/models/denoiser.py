@@ -58,6 +58,11 @@ class DenoiserConfig:
     ordered: bool = False
     self_conditioning: bool = False
 
+    @property
+    def trims(self) -> bool:
+        """Whether padding may be left out: not where the network is trained to see it."""
+        return self.conditioning == "cross" or self.mask_padding
+
 
 class Denoiser(nn.Module):
     """Noisy poses, time, shapes and a silhouette in; an estimate per block out.

@@ -13,10 +13,11 @@ from torch import Tensor, nn
 
 from stackgen.geometry import PAPER_GRID, Grid, Mask
 from stackgen.models.denoiser import POSE, Denoiser, DenoiserConfig, raster_order
+from stackgen.models.network_sampler import NetworkSampler
 from stackgen.models.sampler_config import SamplerConfig
 from stackgen.models.samplers import Callback, Predict, ancestral, multistep
 from stackgen.models.schedules import Schedule, ScheduleConfig
-from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Stack, StackgenError, shapes_of
+from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Stack, StackgenError
 
 
 @dataclass(frozen=True)
@@ -192,6 +193,11 @@ class PoseDiffusion(nn.Module):
 
         return predict
 
+    @property
+    def trims(self) -> bool:
+        """See DenoiserConfig."""
+        return self.denoiser.config.trims
+
     def _guided(self, own: Predict, other: Predict, config: SamplerConfig) -> Predict:
         """Away from what a weaker version of the model would do (autoguidance, Karras et al. 2024), or towards it."""
         assert config.guided is not None and config.guidance is not None
@@ -212,7 +218,7 @@ class PoseDiffusion(nn.Module):
         return same and self.schedule.config == other.schedule.config
 
 
-class DiffusionSampler:
+class DiffusionSampler(NetworkSampler):
     """A StackSampler: the diffusion model with its world.
 
     Args:
@@ -237,9 +243,7 @@ class DiffusionSampler:
         sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
     ) -> None:
         self.model = model.eval()
-        self.catalogue, self.grid, self.max_blocks = catalogue, grid, max_blocks
-        self.card = card or {}
-        self.batch = batch
+        super().__init__(self.model, catalogue, grid, max_blocks, card, batch)
         self.sampler = self.model.complete(sampler.over(SamplerConfig.of_card(self.card)))
         self.guide = None if self.sampler.guide is None else self._guide(self.sampler.guide)
 
@@ -276,48 +280,9 @@ class DiffusionSampler:
         Raises:
             StackgenError: If a block list is empty or longer than the model takes, or sizes differ.
         """
-        if num_samples < 1:
-            raise StackgenError(f"the number of samples must be at least 1, got {num_samples}")
-        size = self.grid.image_size
-        if silhouettes.ndim != 3 or silhouettes.shape[1:] != (size, size) or len(counts) != len(silhouettes):
-            raise StackgenError(f"sampling needs silhouettes (B, {size}, {size}) and as many block lists")
-        totals = np.asarray(counts).sum(axis=1)
-        if len(totals) and not (totals.min() >= 1 and totals.max() <= self.max_blocks):
-            raise StackgenError(f"this model takes 1 to {self.max_blocks} blocks, got {sorted(set(totals.tolist()))}")
-        stacks: list[list[Stack]] = []
-        scenes = max(1, self.batch // num_samples)
-        device = self.model.mean.device
-        generator = torch.Generator().manual_seed(seed)
-        for start in range(0, len(counts), scenes):
-            part = slice(start, start + scenes)
-            shapes, mask = pad_shapes(counts[part], int(totals[part].max()) if self._trims else self.max_blocks)
-            shown = None if callback is None else (lambda t, x: callback(t, x.double().cpu().numpy()))
-            poses = self.model.sample(
-                torch.from_numpy(np.ascontiguousarray(silhouettes[part], dtype=np.float32)).to(device),
-                torch.from_numpy(np.repeat(shapes, num_samples, axis=0)).to(device),
-                torch.from_numpy(np.repeat(mask, num_samples, axis=0)).to(device),
-                generator,
-                shown,
-                self.sampler,
-                self.guide,
-            )
-            found = poses.double().cpu().numpy().reshape(len(shapes), num_samples, -1, POSE)
-            for scene, row in enumerate(found):
-                kinds = shapes[scene][mask[scene]]
-                stacks.append([Stack(kinds, p[: len(kinds)], self.catalogue) for p in row])
-        return stacks
+        shown = None if callback is None else (lambda t, x: callback(t, x.double().cpu().numpy()))
 
-    @property
-    def _trims(self) -> bool:
-        """Whether padding may be left out: not where the network was trained to see it."""
-        config = self.model.denoiser.config
-        return config.conditioning == "cross" or config.mask_padding
+        def draw(pictures: Tensor, shapes: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
+            return self.model.sample(pictures, shapes, mask, generator, shown, self.sampler, self.guide)
 
-
-def pad_shapes(counts: NDArray[np.int64], length: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Block lists (B, S) as shape indices (B, length), padded with -1, and the mask of real blocks."""
-    rows = [shapes_of(row) for row in counts]
-    shapes = np.full((len(rows), length), -1, dtype=np.int64)
-    for i, row in enumerate(rows):
-        shapes[i, : len(row)] = row
-    return shapes, shapes >= 0
+        return self._answer(silhouettes, counts, num_samples, seed, draw)

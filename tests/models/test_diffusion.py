@@ -13,7 +13,8 @@ from torch import Tensor
 from stackgen.data.arrays import StackArrays
 from stackgen.geometry import Mask
 from stackgen.models.denoiser import DenoiserConfig
-from stackgen.models.diffusion import DiffusionConfig, DiffusionSampler, PoseDiffusion, pad_shapes
+from stackgen.models.diffusion import DiffusionConfig, DiffusionSampler, PoseDiffusion
+from stackgen.models.network_sampler import pad_shapes
 from stackgen.models.sampler_config import SPACING, SamplerConfig
 from stackgen.models.schedules import ScheduleConfig
 from stackgen.stack import StackgenError, shapes_of

@@ -1,0 +1,109 @@
+"""Trained networks as StackSamplers: questions in batches, answers as stacks.
+
+Legend: B scenes, S shapes, N blocks at most, H x W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from stackgen.geometry import PAPER_GRID, Grid, Mask
+from stackgen.models.denoiser import POSE
+from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Stack, StackgenError, shapes_of
+
+Draw = Callable[[Tensor, Tensor, Tensor, torch.Generator], Tensor]
+"""Silhouettes (B, H, W), shapes (B * n, N) and their mask, to poses (B * n, N, 6) [cell, rad]."""
+
+
+class PoseModel(Protocol):
+    """A network that estimates or samples poses.
+
+    `mean` is a part of its normalisation and lies on its device; `trims` says that padding may be
+    left out, which is wrong where a network was trained to see it.
+    """
+
+    @property
+    def mean(self) -> Tensor: ...
+
+    @property
+    def trims(self) -> bool: ...
+
+
+class NetworkSampler:
+    """What samplers of trained networks share: their world, and questions answered some at a time.
+
+    Args:
+        model: Trained.
+        catalogue, grid, max_blocks: The world it was trained in.
+        card: What is known about the weights.
+        batch: Stacks made together, at most.
+    """
+
+    def __init__(
+        self,
+        model: PoseModel,
+        catalogue: Catalogue = PAPER_CATALOGUE,
+        grid: Grid = PAPER_GRID,
+        max_blocks: int = MAX_BLOCKS,
+        card: dict[str, Any] | None = None,
+        batch: int = 512,
+    ) -> None:
+        self.catalogue, self.grid, self.max_blocks = catalogue, grid, max_blocks
+        self.card = card or {}
+        self.batch = batch
+        self._network = model
+
+    def _answer(
+        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int, draw: Draw
+    ) -> list[list[Stack]]:
+        """`num_samples` stacks for each silhouette and block list.
+
+        Raises:
+            StackgenError: If a block list is empty or longer than the model takes, or sizes differ.
+        """
+        totals = self._check(silhouettes, counts, num_samples)
+        stacks: list[list[Stack]] = []
+        scenes = max(1, self.batch // num_samples)
+        device = self._network.mean.device
+        generator = torch.Generator().manual_seed(seed)
+        for start in range(0, len(counts), scenes):
+            part = slice(start, start + scenes)
+            longest = int(totals[part].max()) if self._network.trims else self.max_blocks
+            shapes, mask = pad_shapes(counts[part], longest)
+            poses = draw(
+                torch.from_numpy(np.ascontiguousarray(silhouettes[part], dtype=np.float32)).to(device),
+                torch.from_numpy(np.repeat(shapes, num_samples, axis=0)).to(device),
+                torch.from_numpy(np.repeat(mask, num_samples, axis=0)).to(device),
+                generator,
+            )
+            found = poses.double().cpu().numpy().reshape(len(shapes), num_samples, -1, POSE)
+            for row, real, drawn in zip(shapes, mask, found, strict=True):
+                stacks.append([Stack(row[real], p[: real.sum()], self.catalogue) for p in drawn])
+        return stacks
+
+    def _check(self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int) -> NDArray[np.int64]:
+        """(B,) number of blocks in each list."""
+        if num_samples < 1:
+            raise StackgenError(f"the number of samples must be at least 1, got {num_samples}")
+        size = self.grid.image_size
+        if silhouettes.ndim != 3 or silhouettes.shape[1:] != (size, size) or len(counts) != len(silhouettes):
+            raise StackgenError(f"sampling needs silhouettes (B, {size}, {size}) and as many block lists")
+        totals = np.asarray(counts).sum(axis=1)
+        if len(totals) and not (totals.min() >= 1 and totals.max() <= self.max_blocks):
+            raise StackgenError(f"this model takes 1 to {self.max_blocks} blocks, got {sorted(set(totals.tolist()))}")
+        return totals
+
+
+def pad_shapes(counts: NDArray[np.int64], length: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Block lists (B, S) as shape indices (B, length), padded with -1, and the mask of real blocks."""
+    rows = [shapes_of(row) for row in counts]
+    shapes = np.full((len(rows), length), -1, dtype=np.int64)
+    for i, row in enumerate(rows):
+        shapes[i, : len(row)] = row
+    return shapes, shapes >= 0
