@@ -151,7 +151,7 @@ def scenes_of_kind(kind: str, scenes: Sequence[Scene], checker: StabilityChecker
     from stackgen.images import read_silhouette
 
     if kind == EXAMPLES:
-        files = sorted(DRAWINGS.glob("*.png"))
+        files = sorted(DRAWINGS.iterdir())
         unknown = np.zeros_like(scenes[0].counts)
         return [Scene(file.stem, read_silhouette(file), unknown) for file in files]
     found = []
