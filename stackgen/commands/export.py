@@ -31,6 +31,7 @@ COMMAND = Command(
     stackgen export runs/ddpm-small --out ddpm-small.safetensors
     stackgen export runs/tran-reg --out tran-reg.safetensors --half
     """,
+    flags={"half": "Store matrices as 16-bit floats: half the size."},
     files=Files("checkpoint", "CHECKPOINT", "A .ckpt of `stackgen fit`, or the folder of a run."),
 )
 
