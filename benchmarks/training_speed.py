@@ -1,9 +1,11 @@
-"""Training samples per second of three denoisers of one size, on one and two threads, each in a process of its own.
+"""Training samples per second of four denoisers of one size, on one and two threads, each in a process of its own.
 
 `config` is the network of the configuration; `joint` the paper's encoder over block and silhouette tokens at that
 size; `torch` the same with PyTorch's own `nn.TransformerEncoder` in place of the layers. Lightning trains them as
-`stackgen fit` does: loader, bucketing, mirroring, gradient clipping, AdamW and EMA are in the figures. The stacks are
-those of testset-v1, which any clone has; nothing that is learnt here is kept.
+`stackgen fit` does: loader, bucketing, mirroring, gradient clipping, AdamW and EMA are in the figures. `plain` is
+what one writes first: `torch`'s network under a Trainer with its defaults, from torch's DataLoader, all ten blocks
+of every sample computed; neither `--precision` nor `--allocator` touches it. A draw is a sample with one noise: what a
+network learns from. The stacks are those of testset-v1, which any clone has; nothing that is learnt here is kept.
 """
 
 from __future__ import annotations
@@ -23,9 +25,12 @@ import yaml
 from benchmarks.common import ROOT, argument_parser, peak_rss_mb, plain_table, report, run_child, start
 
 if TYPE_CHECKING:
+    from stackgen.data.arrays import StackArrays
     from stackgen.models.ddpm import DDPM
 
-NETWORKS = ("config", "joint", "torch")
+NETWORKS = ("config", "joint", "torch", "plain")
+ALLOCATOR = {"MALLOC_MMAP_THRESHOLD_": "2000000000", "MALLOC_TRIM_THRESHOLD_": "20000000000"}
+"""Keeps memory that was freed; on a busy machine fresh pages are slow."""
 CONFIG = Path("configs/model/ddpm-small.yaml")
 
 
@@ -36,6 +41,7 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--networks", nargs="+", choices=NETWORKS, default=list(NETWORKS))
     options.add_argument("--threads", nargs="+", type=int, default=[1, 2])
     options.add_argument("--precision", help="of Lightning's Trainer; the configuration's if left out")
+    options.add_argument("--allocator", action="store_true", help="let glibc keep memory that was freed")
     options.add_argument("--warmup", type=int, default=10, help="steps before the clock starts")
     options.add_argument("--steps", type=int, default=100, help="steps that are timed")
     options.add_argument("--child", action="store_true", help="measure one network in this process and print JSON")
@@ -49,6 +55,7 @@ def main() -> None:
         print(json.dumps(measure(options, options.networks[0], options.threads[0])))
         return
     rows = [in_child(options, network, threads) for network in options.networks for threads in options.threads]
+    plain = {row["threads"]: row["samples_per_second"] * row["draws"] for row in rows if row["network"] == "plain"}
     cells = [
         [
             row["network"],
@@ -58,12 +65,19 @@ def main() -> None:
             f"{row['steps_per_second']:.2f}",
             f"{row['samples_per_second']:.0f}",
             f"{row['samples_per_second'] * row['draws']:.0f}",
+            f"{row['samples_per_second'] * row['draws'] / plain[row['threads']]:.1f}" if plain else "",
             f"{row['peak_rss_mb']:.0f}",
         ]
         for row in rows
     ]
-    headings = ("network", "threads", "weights", "draws", "steps/s", "samples/s", "draws/s", "RSS [MB]")
-    figures = {"config": str(options.config), "steps": options.steps, "rows": rows}
+    headings = ("network", "threads", "weights", "draws", "steps/s", "samples/s", "draws/s", "x plain", "RSS [MB]")
+    figures = {
+        "config": str(options.config),
+        "steps": options.steps,
+        "precision": options.precision,
+        "allocator": options.allocator,
+        "rows": rows,
+    }
     report("training_speed", figures, [plain_table(f"Training, {options.config}", headings, cells)], options.out)
 
 
@@ -73,6 +87,8 @@ def in_child(options: argparse.Namespace, network: str, threads: int) -> dict[st
     command += ["--networks", network, "--threads", str(threads)]
     command += ["--warmup", str(options.warmup), "--steps", str(options.steps)]
     command += ["--precision", options.precision] if options.precision else []
+    if options.allocator and network != "plain":
+        command = ["env", *(f"{name}={value}" for name, value in ALLOCATOR.items()), *command]
     return json.loads(run_child(command, threads).output.strip().splitlines()[-1])
 
 
@@ -83,7 +99,7 @@ def measure(options: argparse.Namespace, network: str, threads: int) -> dict[str
 
     from stackgen.callbacks import EMA
     from stackgen.data.arrays import load_dataset
-    from stackgen.data.datamodule import TESTSET, CachedLoader
+    from stackgen.data.datamodule import TESTSET
 
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module="lightning")
@@ -92,22 +108,21 @@ def measure(options: argparse.Namespace, network: str, threads: int) -> dict[str
     config = yaml.safe_load((ROOT / options.config).read_text())
     data, settings = config["data"], config["trainer"]
     arrays = load_dataset(TESTSET, ("test",))[0]["test"]
-    loader = CachedLoader(
-        arrays,
-        data["batch_size"],
-        train=True,
-        bucket_by_blocks=data.get("bucket_by_blocks", False),
-        mirror=data.get("mirror", False),
-    )
+    loader = loader_of(arrays, data, plain=network == "plain")
     module = build(config["model"]["init_args"], network)
     module.model.fit_normalization(*arrays.pose_statistics())
     stopwatch = _stopwatch(options.warmup)
+    recipe: dict[str, Any] = {"callbacks": [stopwatch]}
+    if network != "plain":
+        recipe = {
+            "callbacks": [EMA(), stopwatch],
+            "precision": options.precision or settings.get("precision", "32-true"),
+            "gradient_clip_val": settings.get("gradient_clip_val"),
+        }
     trainer = Trainer(
         accelerator="cpu",
         max_steps=options.warmup + options.steps,
-        precision=options.precision or settings.get("precision", "32-true"),
-        gradient_clip_val=settings.get("gradient_clip_val"),
-        callbacks=[EMA(), stopwatch],
+        **recipe,
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,
@@ -127,6 +142,21 @@ def measure(options: argparse.Namespace, network: str, threads: int) -> dict[str
     }
 
 
+def loader_of(arrays: StackArrays, data: dict[str, Any], plain: bool) -> Any:
+    """Training batches: the configuration's, or those of torch's DataLoader with its defaults."""
+    import numpy as np
+    from torch.utils.data import DataLoader
+
+    from stackgen.data.datamodule import CachedLoader
+
+    if not plain:
+        options = {name: data.get(name, False) for name in ("bucket_by_blocks", "mirror")}
+        return CachedLoader(arrays, data["batch_size"], train=True, **options)
+    batch = arrays.batch(np.arange(len(arrays)))
+    samples = [{name: tensor[i] for name, tensor in batch.items()} for i in range(len(arrays))]
+    return DataLoader(samples, data["batch_size"], shuffle=True)  # type: ignore[arg-type]
+
+
 def build(init_args: dict[str, Any], network: str) -> DDPM:
     """The training module of a configuration, with its own network or one of the other two."""
     from torch import Tensor, nn
@@ -140,7 +170,13 @@ def build(init_args: dict[str, Any], network: str) -> DDPM:
     denoiser = DenoiserConfig(**init_args["denoiser"])
     if network != "config":
         denoiser = dataclasses.replace(
-            denoiser, conditioning="joint", mask_padding=False, patch=16, stride=16, ordered=False
+            denoiser,
+            conditioning="joint",
+            mask_padding=False,
+            patch=16,
+            stride=16,
+            ordered=False,
+            self_conditioning=False,
         )
     module = DDPM(
         denoiser,
@@ -150,7 +186,7 @@ def build(init_args: dict[str, Any], network: str) -> DDPM:
         init_args.get("draws", 1) if network == "config" else 1,  # the joint encoder gains nothing from several
     )
     module.build()
-    if network == "torch":
+    if network in ("torch", "plain"):
 
         class TorchEncoder(nn.Module):
             """All layers as one of Denoiser's."""

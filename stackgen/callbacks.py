@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from stackgen._lightning import pl
+from stackgen.dashboard import log_picture, silhouette_sheet
 from stackgen.data.arrays import Batch
 from stackgen.evaluation import Scene, batch_seed, judge, scenes_of_batch
-from stackgen.geometry import PAPER_GRID
+from stackgen.geometry import PAPER_GRID, Grid
 from stackgen.metrics import SCENE_METRICS, SceneMetric, SceneScore
 from stackgen.protocols import StabilityChecker, StackSampler, Verdict
 from stackgen.stack import PAPER_CATALOGUE, Stack, StackgenError
@@ -153,8 +154,9 @@ class EMA(pl.Callback):
 class SampleQuality(pl.Callback):
     """Every few epochs, and when only validating, samples validation scenes with their true lists and scores them.
 
-    The module's `sampler()` gives the StackSampler; metrics are logged as `sample/<name>`. Without a
-    checker only what needs no physics is logged; whoever builds the trainer may set `checker`.
+    The module's `sampler()` gives the StackSampler; metrics are logged as `sample/<name>`, a picture of some
+    scenes as `sample/scenes`. Without a checker only what needs no physics is logged; whoever builds the
+    trainer may set `checker`, and the command line does.
 
     Args:
         every_n_epochs: 0 never samples.
@@ -162,6 +164,7 @@ class SampleQuality(pl.Callback):
         num_samples: Stacks per scene.
         seed: The same noise each time, so that epochs compare.
         checker: The physics.
+        num_pictures: Scenes in the picture; 0 draws none.
     """
 
     def __init__(
@@ -171,13 +174,15 @@ class SampleQuality(pl.Callback):
         num_samples: int = 1,
         seed: int = 0,
         checker: StabilityChecker | None = None,
+        num_pictures: int = 8,
     ) -> None:
-        if every_n_epochs < 0 or num_scenes < 1 or num_samples < 1:
+        if every_n_epochs < 0 or num_scenes < 1 or num_samples < 1 or num_pictures < 0:
             raise StackgenError(
-                "SampleQuality: num_scenes and num_samples must be at least 1, every_n_epochs 0 or more"
+                "SampleQuality: num_scenes and num_samples must be at least 1,"
+                " every_n_epochs and num_pictures 0 or more"
             )
         self.every_n_epochs, self.num_scenes, self.num_samples = every_n_epochs, num_scenes, num_samples
-        self.seed, self.checker = seed, checker
+        self.seed, self.checker, self.num_pictures = seed, checker, num_pictures
         self._batches: list[Batch] = []
 
     def _due(self, trainer: pl.Trainer) -> bool:
@@ -212,20 +217,30 @@ class SampleQuality(pl.Callback):
         catalogue = getattr(sampler, "catalogue", PAPER_CATALOGUE)
         scenes = [scene for batch in self._batches for scene in scenes_of_batch(batch, catalogue)]
         self._batches = []
-        values = self.measure(sampler, scenes, trainer.global_rank)
-        pl_module.log_dict({f"sample/{name}": value for name, value in values.items()}, sync_dist=True)
-
-    def measure(self, sampler: StackSampler, scenes: list[Scene], rank: int = 0) -> dict[str, float]:
-        """The figures of some scenes, by name; NaN where one does not exist."""
-        grid = getattr(sampler, "grid", PAPER_GRID)
-        silhouettes, counts = np.stack([s.silhouette for s in scenes]), np.stack([s.counts for s in scenes])
         start = time.perf_counter()
-        stacks = sampler.sample_batch(silhouettes, counts, self.num_samples, batch_seed(self.seed, 0, rank))
-        seconds = time.perf_counter() - start
-        scores = [result.score for result in judge(scenes, stacks, self.checker or _NoPhysics(), grid)]
+        stacks = self.draw(sampler, scenes, trainer.global_rank)
+        rate = len(scenes) * self.num_samples / (time.perf_counter() - start)
+        values = {**self.measure(sampler, scenes, stacks), "stacks_per_second": rate}
+        pl_module.log_dict({f"sample/{name}": value for name, value in values.items()}, sync_dist=True)
+        if self.num_pictures and trainer.is_global_zero:
+            firsts, shown = scenes[: self.num_pictures], [samples[0] for samples in stacks[: self.num_pictures]]
+            verdicts = [self.checker.check(stack) if self.checker else None for stack in shown]
+            log_picture(trainer, "sample/scenes", silhouette_sheet(firsts, shown, verdicts, _grid(sampler)))
+
+    def draw(self, sampler: StackSampler, scenes: list[Scene], rank: int = 0) -> list[list[Stack]]:
+        """Stacks for some scenes, the same for the same weights."""
+        silhouettes, counts = np.stack([s.silhouette for s in scenes]), np.stack([s.counts for s in scenes])
+        return sampler.sample_batch(silhouettes, counts, self.num_samples, batch_seed(self.seed, 0, rank))
+
+    def measure(self, sampler: StackSampler, scenes: list[Scene], stacks: list[list[Stack]]) -> dict[str, float]:
+        """The figures of some scenes, by name; NaN where one does not exist."""
+        scores = [r.score for r in judge(scenes, stacks, self.checker or _NoPhysics(), _grid(sampler))]
         names = SCENE_METRICS if self.checker else ("diversity", "front_iou_before_physics")
-        values = {name: _mean(SCENE_METRICS[name], scores) for name in names}
-        return {**values, "stacks_per_second": len(scenes) * self.num_samples / seconds}
+        return {name: _mean(SCENE_METRICS[name], scores) for name in names}
+
+
+def _grid(sampler: StackSampler) -> Grid:
+    return getattr(sampler, "grid", PAPER_GRID)
 
 
 class _NoPhysics:

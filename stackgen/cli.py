@@ -33,15 +33,19 @@ VERBS: dict[str, Verb] = {
     "sample": Verb("stackgen.commands.sample", "turn silhouettes into stacks that stand"),
     "check": Verb("stackgen.commands.check", "judge the structures of a file: which stand, which fall"),
     "show": Verb("stackgen.commands.show", "draw the structures of a file, as a picture and in 3-D"),
+    "capture": Verb("stackgen.commands.capture", "find the silhouette in a depth frame or a photo of a sketch"),
+    "build": Verb("stackgen.commands.build", "build a structure with a UR5 and parallel jaws, in simulation"),
     "generate": Verb("stackgen.commands.generate", "make a dataset by deconstruction"),
     "dataset": Verb("stackgen.commands.dataset", "verify, repair, describe, split or export a dataset"),
     "fit": Verb("stackgen.commands.lightning", "train a model"),
     "validate": Verb("stackgen.commands.lightning", "validate a model on the validation split"),
     "test": Verb("stackgen.commands.lightning", "run the paper's protocol on the frozen test set"),
     "predict": Verb("stackgen.commands.lightning", "sample stacks for a split of a dataset"),
+    "sweep": Verb("stackgen.commands.sweep", "try many settings of a training, locally or at W&B"),
     "prefer": Verb("stackgen.commands.prefer", "pair failures of a model with stacks that stand, to fine-tune it"),
     "report": Verb("stackgen.commands.report", "make the paper's table with every row, and its charts"),
     "export": Verb("stackgen.commands.export", "turn a training checkpoint into weights with a card"),
+    "completion": Verb("stackgen.commands.completion", "print a script that completes this command line in a shell"),
 }
 
 

@@ -149,7 +149,7 @@ SCENE_METRICS: dict[str, SceneMetric] = {
     "iou_given_stable": iou_given_stable,
     "front_iou_before_physics": front_iou_before,
 }
-"""By the name they have in logs, tables and `metrics.json`."""
+"""By the name they have in logs, tables and `metrics.json`; what is added here is measured too."""
 
 
 class _Ratio(Metric):
@@ -177,6 +177,12 @@ class _Ratio(Metric):
 
 class _SceneMean(_Ratio):
     per_scene: SceneMetric
+
+    @classmethod
+    def of(cls, per_scene: SceneMetric) -> type[_SceneMean]:
+        """The class of a metric; one that has none is made here."""
+        known = next((c for c in cls.__subclasses__() if c.per_scene is per_scene), None)
+        return known or type(per_scene.__name__, (cls,), {"per_scene": staticmethod(per_scene)})
 
     def update(self, scenes: Sequence[SceneScore]) -> None:
         """Add some scenes."""
@@ -227,8 +233,7 @@ class FrontIoUBeforePhysics(_SceneMean):
 
 def scene_metrics(prefix: str = "") -> MetricCollection:
     """All metrics of generated stacks, to be updated with sequences of :class:`SceneScore`."""
-    classes = (StabilityRate, Diversity, FrontIoU, AverageIoU, ValidDiversity, IoUGivenStable, FrontIoUBeforePhysics)
-    named: dict[str, Metric | MetricCollection] = {n: c() for n, c in zip(SCENE_METRICS, classes, strict=True)}
+    named: dict[str, Metric | MetricCollection] = {n: _SceneMean.of(f)() for n, f in SCENE_METRICS.items()}
     return MetricCollection(named, prefix=prefix, compute_groups=False)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections import ChainMap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -72,7 +73,7 @@ def view_iou(view: View) -> SceneMetric:
     return metric
 
 
-METRICS: dict[str, SceneMetric] = {**SCENE_METRICS, "side_iou": view_iou("side"), "top_iou": view_iou("top")}
+METRICS = ChainMap[str, SceneMetric]({"side_iou": view_iou("side"), "top_iou": view_iou("top")}, SCENE_METRICS)
 """All that is measured of a scene's samples: the protocol's metrics, and the views that its average is made of."""
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import signal
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from stackgen.api import Model
 from stackgen.cli import main
 from stackgen.geometry import Mask
+from stackgen.metrics import SCENE_METRICS
 from stackgen.stack import Stack, shapes_of
 
 settings.register_profile("patient", deadline=None)  # on a busy machine the slowest example says nothing
@@ -184,3 +186,13 @@ def towers_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     physics = Physics().to_json()
     Manifest("towers", 0, PAPER_CATALOGUE, PAPER_GRID, MAX_BLOCKS, physics, {}, tuple(entries)).save(folder)
     return folder
+
+
+@pytest.fixture
+def no_new_metrics(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A metric that a test adds is measured in this test alone."""
+    before = dict(SCENE_METRICS)
+    monkeypatch.delitem(sys.modules, "examples.extending.metric", raising=False)  # it adds one when it is loaded
+    yield
+    SCENE_METRICS.clear()
+    SCENE_METRICS.update(before)

@@ -28,10 +28,10 @@ from tests.conftest import Cli
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 QUICK = CONFIGS / "quick.yaml"
-OVERLAY = CONFIGS / "warm-start.yaml"  # no configuration of its own
-ALL = sorted(path for path in CONFIGS.rglob("*.yaml") if path != OVERLAY)
+OVERLAY, TRIAL = CONFIGS / "warm-start.yaml", CONFIGS / "trial.yaml"  # no configurations of their own
+ALL = sorted(path for path in CONFIGS.rglob("*.yaml") if path not in (OVERLAY, TRIAL))
 WORLDS = CONFIGS / "worlds"
-VERB_OF_FOLDER = {"generate": "generate", "model": "fit", "baselines": "fit"}
+VERB_OF_FOLDER = {"generate": "generate", "model": "fit", "baselines": "fit", "sweeps": "sweep"}
 
 Load = Callable[[Path], dict[str, Any]]
 

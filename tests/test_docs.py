@@ -9,6 +9,7 @@ import io
 import re
 import shlex
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 
 import pytest
@@ -33,7 +34,7 @@ def snippets(text: str) -> list[Snippet]:
     """The Python blocks of a page, each with the text block right below it."""
     blocks = list(FENCED.finditer(text))
     found = []
-    for block, after in zip(blocks, [*blocks[1:], None], strict=True):
+    for block, after in zip_longest(blocks, blocks[1:]):
         if block[1] == "python":
             shows = after is not None and after[1] == "text" and not text[block.end() : after.start()].strip()
             found.append(Snippet(block[2], after[2] if after is not None and shows else None))
@@ -56,7 +57,9 @@ def test_a_snippet_is_known_with_its_output() -> None:
 
 
 @pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: page.stem)
-def test_the_python_of_a_page_prints_what_the_page_says(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_python_of_a_page_prints_what_the_page_says(
+    page: Path, monkeypatch: pytest.MonkeyPatch, no_new_metrics: None
+) -> None:
     monkeypatch.chdir(ROOT)
     names: dict[str, object] = {}
     for snippet in snippets(page.read_text()):

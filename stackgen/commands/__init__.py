@@ -51,12 +51,14 @@ class Files:
         metavar: What the help calls it.
         help: What it is.
         many: Any number of paths, at least one, instead of exactly one.
+        optional: One path or none.
     """
 
     parameter: str
     metavar: str
     help: str
     many: bool = False
+    optional: bool = False
 
 
 @dataclass(frozen=True)
@@ -70,6 +72,7 @@ class Command:
         files: The paths it takes, if any.
         settings: A parameter that is a dataclass whose fields are options of their own, without a prefix.
         flags: Boolean parameters that are switched on by naming them, and their help.
+        interpolation: Whether `${...}` in configuration files stands for another option's value.
     """
 
     verb: str
@@ -78,6 +81,7 @@ class Command:
     files: Files | None = None
     settings: tuple[str, type] | None = None
     flags: Mapping[str, str] = field(default_factory=dict)
+    interpolation: bool = True
 
     def parser(self) -> ArgumentParser:
         """The parser; it raises its errors instead of printing them."""
@@ -88,11 +92,11 @@ class Command:
             formatter_class=HelpFormatter,
             exit_on_error=False,
             allow_abbrev=False,
-            parser_mode="omegaconf+",
+            parser_mode="omegaconf+" if self.interpolation else "yaml",
         )
         parser.add_argument(*CONFIG_FLAGS, action="config", help=CONFIG_HELP)
         if self.files:
-            nargs = "+" if self.files.many else None
+            nargs = "+" if self.files.many else "?" if self.files.optional else None
             parser.add_argument(
                 self.files.parameter, nargs=nargs, type=Path, metavar=self.files.metavar, help=self.files.help
             )

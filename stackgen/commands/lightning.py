@@ -2,34 +2,41 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
 import signal
+import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # Lightning 2.6 calls what jsonargparse 5 drops
 os.environ.setdefault("WANDB_SILENT", "true")
 
 import torch
 import yaml
-from jsonargparse import set_parsing_settings
+from jsonargparse import ArgumentParser, set_parsing_settings
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
-from lightning.pytorch.cli import ArgsType, LightningArgumentParser, LightningCLI
-from lightning.pytorch.loggers import CSVLogger, Logger, WandbLogger
+from lightning.pytorch.cli import ArgsType, LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, WandbLogger
 
+from stackgen.callbacks import SampleQuality, Throughput
 from stackgen.commands import CONFIG_FLAGS, HelpFormatter, epilog, option_values, own_sections, parse
 from stackgen.commands.protocol import WeightsUnderTest, run_protocol, write_predictions
+from stackgen.dashboard import StepFigures
 from stackgen.data.datamodule import TESTSET, StackDataModule
 from stackgen.data.physics import warn_of_other_physics
+from stackgen.data.shards import manifest_sha256
 from stackgen.files import write_atomically
 from stackgen.models.world import CHECKPOINT_KEY
-from stackgen.runs import RUNS, config_of, last_checkpoint, new_run
+from stackgen.protocols import StabilityChecker
+from stackgen.runs import RUNS, code_version, config_of, last_checkpoint, new_run
 from stackgen.sim.physics import Physics
 from stackgen.stack import StackgenError
+from stackgen.sweeps.telling import TellSweep, in_a_sweep
 
 EXAMPLES = {
     "fit": """
@@ -40,26 +47,21 @@ stackgen fit --config configs/model/ddpm-small.yaml --data.path data/paper --ckp
     "predict": "stackgen predict --model.weights runs/ddpm-small/version_0/checkpoints/last.ckpt",
 }
 
+Dashboard = Literal["wandb", "wandb-offline", "tensorboard", "none"]
+
 _FOLDER = "STACKGEN_RUN_FOLDER"  # tells the other processes of a distributed run where the first one writes
 
 
 def run(verb: str, argv: Sequence[str]) -> None:
     """Parse, build and run one of Lightning's verbs."""
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # for a class_path of the user's own
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)  # else `${...}` starts at the subcommand
     for chatty in ("lightning.pytorch", "lightning.fabric"):  # seeds, devices and advertisements
         logging.getLogger(chatty).setLevel(logging.WARNING)
     interrupt = signal.getsignal(signal.SIGINT)
     try:
-        StackgenCLI(
-            LightningModule,
-            StackDataModule,
-            subclass_mode_model=True,
-            auto_configure_optimizers=False,
-            seed_everything_default=0,
-            trainer_defaults={"default_root_dir": str(RUNS)},
-            parser_kwargs=_parser_options(),
-            args=[verb, *own_sections(verb, argv)],
-        )
+        _command_line(StackgenCLI, [verb, *own_sections(verb, argv)])
     except SystemExit as stop:  # Lightning answers Ctrl-C by exit(1)
         if not isinstance(stop.__context__, KeyboardInterrupt):
             raise
@@ -72,6 +74,35 @@ def run(verb: str, argv: Sequence[str]) -> None:
         ) from error
     finally:
         signal.signal(signal.SIGINT, interrupt)  # Lightning leaves it ignored
+
+
+def parser_of(verb: str) -> ArgumentParser:
+    """The parser of one of Lightning's verbs, to be looked at."""
+    made: list[StackgenCLI] = []
+
+    class NothingRuns(StackgenCLI):
+        def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:
+            made.append(self)
+            raise StopIteration
+
+    with contextlib.suppress(StopIteration):
+        _command_line(NothingRuns, [verb])
+    return made[0]._parser(verb)
+
+
+def _command_line(kind: type[StackgenCLI], arguments: list[str]) -> None:
+    """Parse, build and run."""
+    kind(
+        LightningModule,
+        StackDataModule,
+        subclass_mode_model=True,
+        auto_configure_optimizers=False,
+        seed_everything_default=0,
+        trainer_defaults={"default_root_dir": str(RUNS)},
+        parser_kwargs=_parser_options(),
+        save_config_callback=SaveRun,
+        args=arguments,
+    )
 
 
 class StackgenCLI(LightningCLI):
@@ -90,6 +121,12 @@ class StackgenCLI(LightningCLI):
             type=str,
             default="run",
             help="Of the run; its files go to NAME/VERB_N in trainer.default_root_dir.",
+        )
+        parser.add_argument(
+            "--dashboard",
+            type=Dashboard,
+            default="wandb",
+            help="Where fit's curves and pictures go, beside metrics.csv: wandb is offline without WANDB_API_KEY.",
         )
 
     def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:
@@ -113,6 +150,7 @@ class StackgenCLI(LightningCLI):
         """Make the run's folder, once model and data are there; keep logs and checkpoints in it."""
         verb, config = str(self.subcommand), self._get(self.config_init, "trainer")
         self.folder: Path | None = None
+        given: list[Callback] = [config.callbacks] if isinstance(config.callbacks, Callback) else config.callbacks or []
         if not config.fast_dev_run:
             if verb in ("fit", "validate"):
                 manifest = self.datamodule.manifest  # a mistake in the path must not leave an empty run behind
@@ -123,9 +161,15 @@ class StackgenCLI(LightningCLI):
             kind = "version" if verb == "fit" else verb
             self.folder = _run_folder(self._get(self.config, "name"), Path(config.default_root_dir), kind)
             if config.logger in (None, True):
-                kwargs["logger"] = _loggers(self.folder, dashboard=verb == "fit")
-            if verb == "fit" and config.enable_checkpointing is not False:
-                kwargs["callbacks"] = _with_checkpoints(config.callbacks, self.folder)
+                dashboard: Dashboard = self._get(self.config, "dashboard") if verb == "fit" else "none"
+                kwargs["logger"] = _loggers(self.folder, dashboard)
+            if verb == "fit":
+                kwargs["callbacks"] = _watched(given)
+                if config.enable_checkpointing is not False:
+                    kwargs["callbacks"] = _with_checkpoints(kwargs["callbacks"], self.folder)
+        for callback in given:
+            if isinstance(callback, SampleQuality) and callback.checker is None:
+                callback.checker = _physics(self.datamodule)
         return super().instantiate_trainer(**kwargs)
 
     def test(self, model: LightningModule, datamodule: StackDataModule, **options: Any) -> None:
@@ -158,6 +202,25 @@ class StackgenCLI(LightningCLI):
             metrics = {name: float(value) for name, value in self.trainer.callback_metrics.items()}
             write_atomically(path, (json.dumps(metrics, indent=1) + "\n").encode())
         print(f"wrote {path}")
+
+
+class SaveRun(SaveConfigCallback):
+    """Writes down what made a run, also for its dashboards: its configuration; code, data and command in `run.json`."""
+
+    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """On the first process, once the folder is there."""
+        config = yaml.safe_load(self.parser.dump(self.config, skip_none=False))
+        facts: dict[str, Any] = {"code": code_version(), "command": ["stackgen", *sys.argv[1:]]}
+        data = getattr(trainer, "datamodule", None)
+        if isinstance(data, StackDataModule) and stage in ("fit", "validate"):
+            manifest = data.manifest
+            facts["dataset"] = {"path": data.path, "name": manifest["name"], "sha256": manifest_sha256(manifest)}
+        for logger in trainer.loggers:
+            if isinstance(logger, CSVLogger):
+                path = Path(logger.log_dir) / "run.json"
+                write_atomically(path, (json.dumps(facts, indent=1) + "\n").encode())
+            else:
+                logger.log_hyperparams({**config, "run": facts})
 
 
 def _parser_options() -> dict[str, Any]:
@@ -238,21 +301,40 @@ def _run_folder(name: str, root: Path, kind: str) -> Path:
     return folder
 
 
-def _loggers(folder: Path, dashboard: bool) -> list[Logger]:
-    """CSV, and for training wandb: offline unless the user has an account."""
+def _loggers(folder: Path, dashboard: Dashboard) -> list[Logger]:
+    """CSV, and what else was asked for; a trial of a sweep is watched by its sweep alone."""
     csv = CSVLogger(folder.parent.parent, folder.parent.name, folder.name)
-    if not dashboard:
+    if dashboard == "none" or in_a_sweep():
         return [csv]
-    _ = csv.experiment  # before wandb puts files into its folder
-    offline = not os.environ.get("WANDB_API_KEY")
-    wandb = WandbLogger(f"{folder.parent.name}-{folder.name}", folder, project="stackgen", offline=offline)
+    _ = csv.experiment  # before others put files into its folder
+    if dashboard == "tensorboard":
+        return [csv, TensorBoardLogger(folder, "", "", default_hp_metric=False)]
+    offline = dashboard == "wandb-offline" or not os.environ.get("WANDB_API_KEY")
+    name = f"{folder.parent.name}-{folder.name}"
+    wandb = WandbLogger(name, folder, project="stackgen", offline=offline, log_model=not offline)
     getattr(wandb, "_wandb_init", {}).pop("anonymous", None)  # wandb warns about it, whatever its value
     return [csv, wandb]
 
 
-def _with_checkpoints(callbacks: list[Callback] | None, folder: Path) -> list[Callback]:
+def _watched(callbacks: list[Callback]) -> list[Callback]:
+    """The callbacks, with those that a dashboard lives on; in a sweep, with the one that tells it."""
+    found = list(callbacks)
+    found += [kind() for kind in (StepFigures, Throughput) if not any(isinstance(c, kind) for c in found)]
+    return [*found, TellSweep()] if in_a_sweep() else found
+
+
+def _physics(data: StackDataModule) -> StabilityChecker | None:
+    """The simulator, where it is installed: training does without it."""
+    try:
+        from stackgen.sim.verdict import SimulatorChecker
+    except ModuleNotFoundError:
+        return None
+    return SimulatorChecker(Physics.of_world(data.manifest.get("physics")), data.catalogue)
+
+
+def _with_checkpoints(callbacks: list[Callback], folder: Path) -> list[Callback]:
     """The callbacks, with one that keeps the last state if there is none that keeps any."""
-    found = list(callbacks or [])
+    found = list(callbacks)
     if not any(isinstance(callback, ModelCheckpoint) for callback in found):
         found.append(ModelCheckpoint(folder / "checkpoints", save_last=True, save_on_exception=True))
     return found

@@ -1,0 +1,16 @@
+"""A metric of your own: how often at least one of a scene's samples stands and matches."""
+
+from stackgen.callbacks import SampleQuality
+from stackgen.metrics import SCENE_METRICS, SceneScore
+
+
+def best_of_all(scene: SceneScore) -> tuple[float, float]:
+    """A metric is a function of one scene's scores: (sum, weight); over scenes it is sum over weight."""
+    return float(any(sample.valid for sample in scene.samples)), 1
+
+
+SCENE_METRICS["best_of_all"] = best_of_all  # in logs, in `metrics.json` with its interval, and under Trainer.test
+
+
+class Quality(SampleQuality):
+    """Named in a configuration, this file is loaded, and `sample/best_of_all` is logged."""

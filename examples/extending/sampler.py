@@ -1,0 +1,36 @@
+"""The model of model.py as whoever measures, reports, draws or builds wants it: a StackSampler."""
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from examples.extending.model import SilhouetteMLP
+from stackgen.geometry import Mask
+from stackgen.stack import Stack, StackgenError, shapes_of
+
+
+class MLPSampler:
+    """One method, `sample_batch`; here from a module in training, or from a checkpoint."""
+
+    def __init__(self, trained: SilhouetteMLP | str) -> None:
+        self.module = load(trained) if isinstance(trained, str) else trained
+        self.catalogue, self.grid = self.module.catalogue, self.module.grid
+
+    @torch.no_grad()
+    def sample_batch(
+        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
+    ) -> list[list[Stack]]:
+        poses = self.module(torch.from_numpy(silhouettes).float(), torch.from_numpy(counts)).double().numpy()
+        stacks = [Stack(shapes_of(c), p[: c.sum()], self.catalogue) for c, p in zip(counts, poses, strict=True)]
+        return [[stack] * num_samples for stack in stacks]
+
+
+def load(checkpoint: str) -> SilhouetteMLP:
+    """The module of a checkpoint; only tensors and plain values are read from it."""
+    content = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    if content.get("stackgen", {}).get("kind") != SilhouetteMLP.kind:
+        raise StackgenError(f"{checkpoint} is no checkpoint of a SilhouetteMLP")
+    module = SilhouetteMLP(**content["stackgen"]["config"])
+    module.on_load_checkpoint(content)  # takes the world from it, and builds the network
+    module.load_state_dict(content["state_dict"])
+    return module

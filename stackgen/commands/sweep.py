@@ -1,0 +1,66 @@
+"""stackgen sweep: many trials of a program, the best configuration at the end."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from stackgen.commands import Command
+from stackgen.commands.progress import progress_bar
+from stackgen.runs import RUNS
+from stackgen.stack import StackgenError
+from stackgen.sweeps.file import Sweep
+
+
+def main(sweep: Sweep, out: Path | None = None, parallel: int = 1, seed: int = 0, export_wandb: bool = False) -> None:
+    """Try many settings of a program: a W&B sweep file, run here by Optuna with no account.
+
+    Stopped or killed, it goes on with the same command.
+
+    Args:
+        sweep: What to try.
+        out: Folder of the sweep; runs/sweeps/NAME by default.
+        parallel: Trials at once, each with its share of the processor's cores.
+        seed: Of the proposals.
+        export_wandb: Whether to print the file for `wandb sweep` instead.
+    """
+    if export_wandb:
+        sys.stdout.write(sweep.to_yaml())
+        return
+    if parallel < 1:
+        raise StackgenError(f"--parallel must be at least 1, got {parallel}")
+    from stackgen.sweeps.coordinator import JOURNAL, run_sweep, trials_wanted
+    from stackgen.sweeps.findings import leaderboard_table, ranking, write_findings
+
+    folder = out or RUNS / "sweeps" / sweep.name
+    with progress_bar(sweep.name, trials_wanted(sweep)) as (advance, tell):
+        try:
+            study = run_sweep(sweep, folder, parallel, seed, tell, advance)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt("go on with the same command") from None
+    written = write_findings(study, sweep, folder)
+    Console().print(leaderboard_table(ranking(study), sweep))
+    print(*(f"wrote {path}" for path in written), sep="\n")
+    print(f"to look at every trial: optuna-dashboard {folder / JOURNAL}")
+
+
+COMMAND = Command(
+    "sweep",
+    main,
+    """
+    stackgen sweep --config configs/sweeps/ddpm.yaml --parallel 2
+    stackgen sweep --config configs/sweeps/ddpm.yaml --run_cap 60 --out runs/sweeps/longer
+    stackgen sweep --config configs/sweeps/ddpm.yaml --export_wandb > sweep.yaml
+    """,
+    settings=("sweep", Sweep),
+    flags={"export_wandb": "Print the file for `wandb sweep` instead of running it."},
+    interpolation=False,  # `${args}` of a sweep file is for W&B
+)
+
+
+def run(verb: str, argv: Sequence[str]) -> int | None:
+    """Run the verb."""
+    return COMMAND.run(argv)

@@ -1,0 +1,114 @@
+"""What a person watches while a model trains, beside its losses: pictures, learning rate, gradient norm.
+
+The figures go through Lightning's `log` to every logger there is; pictures go to wandb, to TensorBoard, and as
+PNG files to the folder of a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from stackgen._lightning import pl
+from stackgen.evaluation import Scene
+from stackgen.geometry import PAPER_GRID, Grid, Mask, silhouette
+from stackgen.protocols import Verdict
+from stackgen.render import FALLEN, Colour, Picture, save_image
+from stackgen.stack import Stack, StackgenError
+
+_SCALE = 2  # of the pictures' pixels to the silhouettes'
+_GAP, _CAPTION, _HEADS = 8, 20, 74  # [pixel]
+_GOOD: Colour = (30, 130, 76)
+_INK: Colour = (40, 42, 48)
+_LIGHT: Colour = (238, 240, 244)
+
+
+class StepFigures(pl.Callback):
+    """Logs `train/learning_rate` and `train/gradient_norm`, that of all gradients together before they are clipped.
+
+    Args:
+        every_n_steps: By default as often as the trainer logs.
+    """
+
+    def __init__(self, every_n_steps: int | None = None) -> None:
+        if every_n_steps is not None and every_n_steps < 1:
+            raise StackgenError(f"StepFigures: every_n_steps must be at least 1, got {every_n_steps}")
+        self.every_n_steps = every_n_steps
+
+    def on_before_optimizer_step(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, optimizer: torch.optim.Optimizer
+    ) -> None:
+        """Look at the gradients, now that they are there."""
+        every = self.every_n_steps or max(1, trainer.log_every_n_steps)  # type: ignore[attr-defined]
+        if trainer.global_step % every:
+            return
+        gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+        norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients))) if gradients else torch.zeros(())
+        figures = {"train/learning_rate": float(optimizer.param_groups[0]["lr"]), "train/gradient_norm": norm}
+        pl_module.log_dict(figures, batch_size=1)
+
+
+def silhouette_sheet(
+    scenes: Sequence[Scene], stacks: Sequence[Stack], verdicts: Sequence[Verdict | None], grid: Grid = PAPER_GRID
+) -> Picture:
+    """One picture: for each scene its target, the silhouettes of the stack as generated and settled, the verdict.
+
+    Args:
+        scenes: What was asked for, one a column.
+        stacks: A stack for each.
+        verdicts: On each; None where there was no physics.
+        grid: Of the silhouettes.
+    """
+    from PIL import Image, ImageDraw
+
+    edge = grid.image_size * _SCALE
+    size = (_HEADS + len(scenes) * (edge + _GAP), 3 * (edge + _GAP) + _CAPTION + _GAP)
+    sheet = Image.new("RGB", size, (255, 255, 255))
+    pen = ImageDraw.Draw(sheet)
+    for row, head in enumerate(("target", "generated", "settled")):
+        pen.text((6, _GAP + row * (edge + _GAP) + edge // 2), head, fill=_INK)
+    for column, (scene, stack, verdict) in enumerate(zip(scenes, stacks, verdicts, strict=True)):
+        x = _HEADS + column * (edge + _GAP)
+        generated = silhouette(stack, "front", grid)
+        settled = None if verdict is None else silhouette(verdict.settled, "front", grid)
+        for row, mask in enumerate((scene.silhouette, generated, settled)):
+            if mask is not None:
+                colour = FALLEN if row == 2 and verdict is not None and not verdict.stable else _INK
+                sheet.paste(Image.fromarray(_coloured(mask, colour)), (x, _GAP + row * (edge + _GAP)))
+        if verdict is not None:
+            text, colour = ("stands", _GOOD) if verdict.stable else (f"{int(verdict.fell.sum())} fell", FALLEN)
+            pen.text((x + 2, _GAP + 3 * (edge + _GAP) - 4), text, fill=colour)
+    return np.asarray(sheet)
+
+
+def _coloured(mask: Mask, colour: Colour) -> Picture:
+    picture = np.where(np.asarray(mask, bool)[..., None], np.array(colour), np.array(_LIGHT)).astype(np.uint8)
+    return picture.repeat(_SCALE, axis=0).repeat(_SCALE, axis=1)
+
+
+def log_picture(trainer: pl.Trainer, name: str, picture: Picture) -> None:
+    """Give a picture to every logger that takes any; a run's folder keeps it as NAME/STEP.png.
+
+    Args:
+        trainer: Whose loggers and step; on other processes than the first nothing happens.
+        name: Such as `sample/scenes`.
+        picture: (H, W, 3).
+    """
+    if not trainer.is_global_zero:
+        return
+    step = trainer.global_step
+    logger: Any
+    for logger in trainer.loggers:
+        experiment = logger.experiment
+        if hasattr(logger, "log_image"):  # wandb
+            logger.log_image(name, [picture])
+        elif hasattr(experiment, "add_image"):  # TensorBoard
+            experiment.add_image(name, picture, step, dataformats="HWC")
+        elif logger.log_dir:
+            folder = Path(logger.log_dir) / "pictures" / name
+            folder.mkdir(parents=True, exist_ok=True)
+            save_image(folder / f"{step:06d}.png", picture)

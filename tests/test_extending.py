@@ -1,0 +1,96 @@
+"""docs/extending.md: what it shows is in examples/extending, short, and works."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from stackgen.commands.generate import COMMAND as GENERATE
+from stackgen.data.generation.generate import GenerateSettings
+from stackgen.metrics import SampleScore, SceneScore, scene_metrics
+from stackgen.results import METRICS
+from stackgen.runs import last_checkpoint
+from tests.conftest import Cli, TinyWeights
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "examples" / "extending"
+PAGE = ROOT / "docs" / "extending.md"
+
+
+@pytest.fixture
+def outside(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As a user works: in a folder of their own, their files on the path."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.iterdir()), ids=lambda path: path.name)
+def test_an_example_is_short_and_on_the_page(path: Path) -> None:
+    if path.suffix not in (".py", ".yaml"):
+        pytest.skip("no example")
+    assert len(path.read_text().splitlines()) < 60
+    assert f"../examples/extending/{path.name}" in PAGE.read_text()
+
+
+def test_a_model_of_one_s_own_is_trained_watched_and_measured(
+    cli: Cli, outside: None, no_new_metrics: None, towers_dataset: Path, tiny: TinyWeights
+) -> None:
+    small = ["--model.width", 8, "--trainer.max_steps", 4, "--trainer.log_every_n_steps", 1]
+    quiet = ["--trainer.enable_progress_bar", "false", "--trainer.enable_model_summary", "false"]
+    data = ["--data.path", towers_dataset, "--data.test_path", towers_dataset]
+    answer = cli("fit", "--config", EXAMPLES / "model.yaml", *data, "--data.batch_size", 24, *small, *quiet)
+    assert answer.code == 0, answer.err
+    text = Path("runs/silhouette-mlp/version_0/metrics.csv").read_text()
+    assert "sample/best_of_all" in text and "validation/loss" in text
+    weights = "{class_path: examples.extending.sampler.MLPSampler, init_args: {trained: CKPT}}"
+    weights = weights.replace("CKPT", str(last_checkpoint(Path("runs/silhouette-mlp"))))
+    options = ["--model.weights", weights, "--model.block_list_weights", tiny.predictor]
+    answer = cli("test", *options, *data, "--model.predicted_lists", "false", *quiet)
+    assert answer.code == 0, answer.err
+    rows = json.loads(Path("runs/run/test_0/metrics.json").read_text())["rows"]
+    assert rows[0]["method"] == "MLPSampler" and "best_of_all" in rows[0]["metrics"]
+
+
+def test_a_method_that_learns_nothing_is_measured(
+    cli: Cli, outside: None, towers_dataset: Path, tiny: TinyWeights
+) -> None:
+    options = [
+        "--model.weights",
+        "{class_path: examples.extending.columns.Columns}",
+        "--model.block_list_weights",
+        tiny.predictor,
+    ]
+    data = ["--data.path", towers_dataset, "--data.test_path", towers_dataset]
+    quiet = ["--trainer.enable_progress_bar", "false", "--model.predicted_lists", "false"]
+    answer = cli("test", *options, *data, *quiet)
+    assert answer.code == 0, answer.err
+    row = json.loads(Path("runs/run/test_0/metrics.json").read_text())["rows"][0]
+    assert row["metrics"]["stability"]["value"] > 0.9 and row["metrics"]["front_iou"]["value"] > 0.5
+
+
+def test_a_metric_of_one_s_own_is_measured_with_the_others(no_new_metrics: None) -> None:
+    good, bad = (SampleScore(stable, {"front": 0.9 * stable}, 0.9, ()) for stable in (True, False))
+    scenes = [SceneScore((good, bad)), SceneScore((bad, bad))]
+    before = scene_metrics()
+    importlib.import_module("examples.extending.metric")
+    after = scene_metrics("test/")
+    after.update(scenes)
+    assert float(after.compute()["test/best_of_all"]) == 0.5
+    assert set(METRICS) == {*before, "best_of_all", "side_iou", "top_iou"}
+
+
+def test_a_shape_of_one_s_own_is_data(tmp_path: Path) -> None:
+    content = yaml.safe_load(io.StringIO((EXAMPLES / "shape.yaml").read_text()))
+    parser = GENERATE.parser()
+    values = parser.instantiate(parser.parse_args(["--config", str(EXAMPLES / "shape.yaml"), "--out", str(tmp_path)]))
+    settings = GenerateSettings(**{name: values[name] for name in GenerateSettings.__dataclass_fields__})
+    assert settings.catalogue.names[-1] == "trapezoid" == content["template"]["top_row_only"][0]
+    assert settings.catalogue[-1].volume == pytest.approx(0.75)
+    assert np.ptp(np.array(settings.catalogue[-1].outline)[:, 0]) == 1
