@@ -1,0 +1,131 @@
+"""Pictures of a simulated build: a PNG of the finished stack, and an MP4 or GIF of how it came to be."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stackgen.render import save_image
+from stackgen.robot.simulation import SimulatedArm
+from stackgen.sim.world import bullet
+from stackgen.stack import StackgenError
+
+Picture = NDArray[np.uint8]
+
+FRAMES = 12  # of a film in a second
+SPEED = 8.0  # simulated seconds in a second of film
+SUFFIXES = (".mp4", ".gif")
+
+_FILM = (480, 360)
+_LAST = 1.5  # the finished stack is shown for so long at the end of a film [s]
+
+
+def check_suffix(path: Path) -> None:
+    """See that a film can be written under this name.
+
+    Raises:
+        StackgenError: If the suffix is unknown, or there is no such folder.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise StackgenError(f"--video {path}: films are written as {' or '.join(SUFFIXES)}; change the suffix")
+    if not path.absolute().parent.is_dir():
+        raise StackgenError(f"--video {path}: there is no folder {path.parent}")
+
+
+def picture(client: int, size: tuple[int, int] = (640, 480), near: bool = False) -> Picture:
+    """(H, W, 3) what a camera in front of the table sees.
+
+    Args:
+        client: Of the world.
+        size: (width, height) [pixel].
+        near: Whether of the structure alone, or with the arm.
+    """
+    target, distance, pitch = ([0, 0, 0.1], 0.62, -14) if near else ([0, 0.08, 0.2], 1.3, -20)
+    view = bullet.computeViewMatrixFromYawPitchRoll(target, distance, 18, pitch, 0, 2)
+    lens = bullet.computeProjectionMatrixFOV(42, size[0] / size[1], 0.05, 5)
+    width, height, colours, *_ = bullet.getCameraImage(
+        *size,
+        view,
+        lens,
+        lightDirection=[-0.4, -0.7, 1.2],
+        shadow=0,
+        renderer=bullet.ER_TINY_RENDERER,
+        physicsClientId=client,
+    )
+    return np.asarray(colours, dtype=np.uint8).reshape(height, width, 4)[..., :3]
+
+
+class Film:
+    """Records a build.
+
+    Args:
+        picture: PNG of the finished stack.
+        video: MP4 or GIF, if wanted; it appears when all of it is written.
+    """
+
+    def __init__(self, picture: Path, video: Path | None = None) -> None:
+        self.picture, self.video = picture, video
+
+    def camera(self, arm: SimulatedArm) -> Callable[[bool], None]:
+        """What is called after every step of an arm, and once at the end."""
+        writer = None if self.video is None else _Writer(self.video)
+        every = max(1, round(SPEED / FRAMES / arm.physics.time_step))
+
+        def step(finished: bool) -> None:
+            if writer is not None and not finished and arm.steps % every == 0:
+                writer.add(picture(arm.client, _FILM))
+            if finished:
+                save_image(self.picture, picture(arm.client, near=True))
+                if writer is not None:
+                    last = picture(arm.client, _FILM)
+                    for _ in range(round(_LAST * FRAMES)):
+                        writer.add(last)
+                    writer.finish()
+
+        return step
+
+
+class _Writer:
+    """Writes frames under a temporary name, and puts the film in its place when it is finished."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.temporary = path.with_name(f".{path.stem[:100]}.{secrets.token_hex(4)}{path.suffix.lower()}")
+        self._mp4: Any = None
+        self._gif: list[Any] = []
+
+    def add(self, frame: Picture) -> None:
+        """One more frame (H, W, 3)."""
+        if self.path.suffix.lower() == ".gif":
+            from PIL import Image
+
+            self._gif.append(Image.fromarray(frame).quantize(64))
+            return
+        import cv2
+
+        if self._mp4 is None:
+            size = frame.shape[1], frame.shape[0]
+            self._mp4 = cv2.VideoWriter(str(self.temporary), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES, size)
+            if not self._mp4.isOpened():
+                raise StackgenError(f"--video {self.path}: no MP4 can be written there; try a .gif")
+        self._mp4.write(np.ascontiguousarray(frame[..., ::-1]))
+
+    def finish(self) -> None:
+        """Put the film in its place."""
+        try:
+            if self._mp4 is not None:
+                self._mp4.release()
+            elif self._gif:
+                first, *others = self._gif
+                first.save(self.temporary, save_all=True, append_images=others, duration=round(1000 / FRAMES), loop=0)
+            os.replace(self.temporary, self.path)
+        except OSError as error:
+            raise StackgenError(f"--video {self.path}: cannot be written: {error.strerror or error}") from error
+        finally:
+            self.temporary.unlink(missing_ok=True)
