@@ -43,6 +43,10 @@ def main() -> None:
     splits, manifest = load_dataset(TESTSET, ("test",))
     test = splits["test"]
     entries = [compare(path, test) for path in options.datasets]
+    names = [entry["name"] for entry in entries]
+    for entry in entries:
+        if names.count(entry["name"]) > 1:  # made by other settings of the generator
+            entry["name"] += f" {entry['sha256'][:8]}"
     rows = [[entry["name"], str(entry["stacks"]), *(str(len(entry["unseen"][notion])) for notion in NOTIONS)]
             for entry in entries]  # fmt: skip
     heading = ("training set", "stacks", *(f"unseen {notion}" for notion in NOTIONS))
