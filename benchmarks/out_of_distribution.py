@@ -34,6 +34,10 @@ METRICS = ("stability", "front_iou", "iou_given_stable")
 DRAWINGS = Path("examples/silhouettes")
 
 Disturb = Callable[[Mask, np.random.Generator], Mask]
+"""Of a picture with PAD pixels more on every side."""
+
+PAD = 32
+"""Room in which a disturbed structure may move before it is framed again [pixel]."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -50,6 +54,31 @@ def parser() -> argparse.ArgumentParser:
     return options
 
 
+def disturbed(mask: Mask, disturb: Disturb, rng: np.random.Generator, centre: bool) -> Mask | None:
+    """The mask (H, W), disturbed, on the ground line; None if it does not fit into the picture any more.
+
+    Args:
+        mask: As it is.
+        disturb: What happens to it.
+        rng: Of what is random in that.
+        centre: Move it to the middle where it would be cut off.
+    """
+    found = disturb(np.pad(mask, PAD), rng)
+    rows, columns = np.flatnonzero(found.any(axis=1)), np.flatnonzero(found.any(axis=0))
+    if not len(rows):
+        return None
+    found = np.roll(found, FOOT - 1 - rows[-1], axis=0)
+    outside = columns[0] < PAD or columns[-1] >= PAD + mask.shape[1]
+    if outside and centre:
+        found = np.roll(found, round((found.shape[1] - 1 - columns[0] - columns[-1]) / 2), axis=1)
+    inside = found[PAD:-PAD, PAD:-PAD]
+    return inside if inside.sum() == found.sum() else None
+
+
+FOOT = round(PAD + PAPER_GRID.image_size - PAPER_GRID.ground_margin)
+"""The ground line, below this row of a padded picture."""
+
+
 def shifted(cells: float) -> Disturb:
     """Moved sideways, to the side that has more room."""
 
@@ -61,15 +90,13 @@ def shifted(cells: float) -> Disturb:
     return disturb
 
 
-def warped(matrix: Callable[[float], NDArray[np.float64]], amount: float) -> Disturb:
-    """Linearly, about the middle of the ground line, to either side; then set down on the ground line."""
+def warped(matrix: Callable[[float], NDArray[np.float64]], amount: float, sides: tuple[int, ...] = (-1, 1)) -> Disturb:
+    """Linearly, about the middle of the ground line, to either side."""
 
     def disturb(mask: Mask, rng: np.random.Generator) -> Mask:
-        side = rng.choice([-1.0, 1.0]) if amount < 45 else 1.0
-        inverse = np.linalg.inv(matrix(side * amount))  # in (row, column)
-        foot = np.array([PAPER_GRID.image_size - PAPER_GRID.ground_margin, PAPER_GRID.image_size / 2]) - 0.5
-        turned = ndimage.affine_transform(mask.astype(float), inverse, foot - inverse @ foot, order=1) >= 0.5
-        return on_ground(turned)
+        inverse = np.linalg.inv(matrix(rng.choice(sides) * amount))  # in (row, column)
+        foot = np.array([FOOT, mask.shape[1] / 2]) - 0.5
+        return ndimage.affine_transform(mask.astype(float), inverse, foot - inverse @ foot, order=1) >= 0.5
 
     return disturb
 
@@ -90,13 +117,6 @@ def scaling(percent: float) -> NDArray[np.float64]:
     return np.eye(2) * percent / 100
 
 
-def on_ground(mask: Mask) -> Mask:
-    """The mask, moved down or up until it touches the ground line."""
-    rows = np.flatnonzero(mask.any(axis=1))
-    foot = round(PAPER_GRID.image_size - PAPER_GRID.ground_margin) - 1
-    return np.roll(mask, foot - rows[-1], axis=0) if len(rows) else mask
-
-
 def rough(mask: Mask, rng: np.random.Generator) -> Mask:
     """Of the pixels on either side of an edge 30 % change; specks go."""
     edge = ndimage.binary_dilation(mask) & ~ndimage.binary_erosion(mask)
@@ -111,7 +131,7 @@ def drawn_by_hand(mask: Mask, rng: np.random.Generator) -> Mask:
     places = [
         place + 1.5 * offset / offset.std() for place, offset in zip(np.indices(mask.shape), offsets, strict=True)
     ]
-    return on_ground(ndimage.map_coordinates(mask.astype(float), places, order=1) >= 0.5)
+    return ndimage.map_coordinates(mask.astype(float), places, order=1) >= 0.5
 
 
 DISTURBANCES: dict[str, Disturb] = {
@@ -122,7 +142,7 @@ DISTURBANCES: dict[str, Disturb] = {
     "turned by 5 degrees": warped(rotation, 5.0),
     "slanted by 5 degrees": warped(shear, 5.0),
     "slanted by 10 degrees": warped(shear, 10.0),
-    "scaled to 90 %": warped(scaling, 90.0),
+    "scaled to 90 %": warped(scaling, 90.0, sides=(1,)),
     "rough edges": rough,
     "drawn by hand": drawn_by_hand,
 }
@@ -138,13 +158,14 @@ def half_cell_steps(truth: Stack, checker: StabilityChecker, rng: np.random.Gene
             poses = truth.poses.copy()
             poses[np.round(poses[:, 2] - 0.5) >= level, 0] += side
             verdict = checker.check(truth.with_poses(poses))
-            if verdict.stable and verdict.at_rest:
+            cut_off = silhouette(verdict.settled)[:, [0, -1]].any()
+            if verdict.stable and verdict.at_rest and not cut_off:
                 return verdict.settled
     return None
 
 
 def scenes_of_kind(kind: str, scenes: Sequence[Scene], checker: StabilityChecker, seed: int) -> list[Scene]:
-    """What is asked for: fewer scenes where a disturbance has no sense."""
+    """What is asked for: fewer scenes where a disturbance has no sense, or what it leaves does not fit the picture."""
     from dataclasses import replace
 
     from stackgen.evaluation import Scene
@@ -162,7 +183,8 @@ def scenes_of_kind(kind: str, scenes: Sequence[Scene], checker: StabilityChecker
             if moved is not None:
                 found.append(Scene(scene.name, silhouette(moved), scene.counts, moved))
         else:
-            found.append(replace(scene, silhouette=DISTURBANCES[kind](scene.silhouette, rng), truth=None))
+            mask = disturbed(scene.silhouette, DISTURBANCES[kind], rng, centre=not kind.startswith("shifted"))
+            found += [] if mask is None else [replace(scene, silhouette=mask, truth=None)]
     return found
 
 
