@@ -1,4 +1,4 @@
-"""stackgen build: a UR5 builds a structure, in simulation."""
+"""stackgen build: a UR5 builds a structure, in simulation or for real."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from rich.table import Table
 from stackgen.api import DEFAULT
 from stackgen.commands import Command, Files
 from stackgen.commands.progress import progress_bar
+from stackgen.commands.real import RealArm, build_for_real, check_options, placed_before, write_sheet
 from stackgen.files import write_atomically
 from stackgen.geometry import Grid, Mask, iou
 from stackgen.robot.cell import Cell, Grasp
@@ -48,8 +49,12 @@ def main(
     video: Path | None = None,
     gui: bool = False,
     cell: Cell = Cell(),  # noqa: B008 - frozen
+    execute: bool = False,
+    yes: bool = False,
+    resume: bool = False,
+    real: RealArm = RealArm(),  # noqa: B008 - frozen
 ) -> int:
-    """Build a structure with a simulated UR5 and parallel jaws; exit code 1 if it does not stand in the end.
+    """Build a structure with a UR5 and parallel jaws, simulated or real; exit code 1 if it does not stand in the end.
 
     Args:
         file: A stacks.json.
@@ -69,12 +74,18 @@ def main(
         video: Film the build: an .mp4 or a .gif.
         gui: Show the build in a window.
         cell: The robot's cell.
+        execute: Have the real arm move; without it everything but that is done.
+        yes: Do not ask before the real arm moves.
+        resume: Go on with the next block of a real build that was interrupted.
+        real: Who builds, and what a real arm needs.
     """
     from stackgen.robot.film import check_suffix
     from stackgen.robot.simulation import require_display
 
     if noise_mm < 0 or noise_deg < 0 or seed < 0:
         raise StackgenError("--noise_mm, --noise_deg and --seed must be at least 0")
+    only_simulated = gui or video is not None or noise_mm > 0 or noise_deg > 0 or grasp != "jaws"
+    check_options(real, execute, yes, resume, only_simulated)
     if video is not None:
         check_suffix(video)
     if gui:
@@ -85,11 +96,14 @@ def main(
         else _from_image(from_image, file, inventory, weights, budget, seed)
     )
     physics = _physics(content)
-    wanted, plan = _planned(entries, cell, physics, order, solver)
+    wanted, plan = _planned(entries, cell, physics, order, solver, placed_before(out, resume))
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StackgenError(f"--out {out}: cannot be made: {error.strerror or error}") from error
+    write_sheet(real, plan, cell, physics.cell_size)
+    if real.arm != "simulation":
+        return build_for_real(plan, cell, real, out, execute, yes, resume)
     noise = noise_mm / 1e3, float(np.radians(noise_deg)), seed
     result = _built(wanted, plan, cell, physics, grasp, noise, content, gui, out / "build.png", video)
     _write(out, result, content, cell, physics, noise)
@@ -175,7 +189,7 @@ def _physics(content: StacksFile) -> Physics:
 
 
 def _planned(
-    entries: Sequence[Entry], cell: Cell, physics: Physics, order: Strategy, solver: SolverName
+    entries: Sequence[Entry], cell: Cell, physics: Physics, order: Strategy, solver: SolverName, placed: int
 ) -> tuple[Design, BuildPlan]:
     """All that can be found out before anything moves, of the first stack that can be built.
 
@@ -192,7 +206,7 @@ def _planned(
             with progress_bar("plan", len(wanted.stack)) as (advance, say):
                 if not wanted.order.safe:
                     say(f"the greedy order is not safe: {wanted.order.blocked}")
-                return wanted, plan_build(wanted.stack, wanted.order.blocks, cell, physics, solver, advance)
+                return wanted, plan_build(wanted.stack, wanted.order.blocks, cell, physics, solver, advance, placed)
         except StackgenError as error:
             reasons.append(error)
     raise reasons[0]
@@ -299,9 +313,17 @@ COMMAND = Command(
     stackgen build out/arch/stacks.json --index 1 --noise_mm 1 --noise_deg 1 --out out/built
     stackgen build --from_image examples/silhouettes/house.png --inventory cube=6,triangle=2 --video house.gif
     stackgen build out/arch/stacks.json --config configs/robot/ur5.yaml --cell.base.position "[0, 0.42, 0]"
+    stackgen build examples/stacks/arch.json --staging_sheet sheet.pdf --arm urscript
+    stackgen build examples/stacks/arch.json --arm ur-rtde --host 192.168.0.10 --execute
     """,
     files=Files("file", "FILE", "A stacks.json.", optional=True),
-    flags={"gui": "Show the build in a window, where there is a display."},
+    settings=("real", RealArm),
+    flags={
+        "gui": "Show the build in a window, where there is a display.",
+        "execute": "Have the real arm move; without it everything but that is done.",
+        "yes": "Do not ask before the real arm moves.",
+        "resume": "Go on with the next block of a real build that was interrupted.",
+    },
 )
 
 

@@ -138,14 +138,16 @@ def test_a_motion_that_starts_elsewhere_is_refused(tmp_path: Path) -> None:
 def test_a_controller_that_is_not_heard_from_stops_the_arm(tmp_path: Path) -> None:
     motion = joint_motion("transit", CELL.home_joints, CELL.home_joints + 0.2, CELL.speeds)
     assert motion is not None
-    with stand_in(tmp_path, "--motion", "60") as controller:
-        with UrArm(controller.host, CELL, Controller(), Gripper()) as arm:
-            assert arm._start(controller_move(motion, CELL))
-            time.sleep(3)  # as if this process hung
-            assert [halt["why"] for halt in controller.events("halt")] == ["watchdog"]
-            with pytest.raises(StackgenError, match="stopped or paused at the controller"):
-                arm.move(motion)
-            assert np.abs(arm.state().joints - CELL.home_joints).max() < 0.02
+    with (
+        stand_in(tmp_path, "--motion", "60") as controller,
+        UrArm(controller.host, CELL, Controller(), Gripper()) as arm,
+    ):
+        assert arm._start(controller_move(motion, CELL))
+        time.sleep(3)  # as if this process hung
+        assert [halt["why"] for halt in controller.events("halt")] == ["watchdog"]
+        with pytest.raises(StackgenError, match="stopped or paused at the controller"):
+            arm.move(motion)
+        assert np.abs(arm.state().joints - CELL.home_joints).max() < 0.02
 
 
 def test_another_tool_than_the_cells_is_noticed(tmp_path: Path) -> None:
