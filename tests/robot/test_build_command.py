@@ -58,6 +58,10 @@ def nothing_moves(monkeypatch: pytest.MonkeyPatch) -> None:
         ([], "give a stacks.json, or a picture with --from_image"),
         (["{stacks}", "--from_image", "a.png"], "not both"),
         (["{stacks}", "--inventory", "cube=1"], "--inventory and --budget go with --from_image"),
+        (["{stacks}", "--execute"], "say --arm ur-rtde"),
+        (["{stacks}", "--arm", "ur-rtde", "--execute"], "needs the address of the arm's controller"),
+        (["{stacks}", "--arm", "urscript", "--video", "a.gif"], "go with the simulated arm"),
+        (["{stacks}", "--staging_sheet", "a.txt"], "a.txt"),
         (["{stacks}", "--video", "a.avi"], "films are written as .mp4 or .gif"),
         (["{stacks}", "--video", "nowhere/a.gif"], "there is no folder nowhere"),
         (["{stacks}", "--gui"], "there is no display"),
@@ -114,3 +118,12 @@ def test_a_clean_picture_and_the_photo_of_an_outline_are_both_seen(tmp_path: Pat
     seen = _seen(file, PAPER_GRID)
     rows, columns = np.nonzero(seen)
     assert seen[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1].mean() > 0.9  # filled in
+
+
+@pytest.mark.usefixtures("nothing_moves")
+def test_for_a_real_arm_a_dry_run_leaves_program_and_sheet(cli: Cli, stacks: Path, tmp_path: Path) -> None:
+    out, sheet = tmp_path / "out", tmp_path / "sheet.svg"
+    answer = cli("build", stacks, "--config", CONFIG, "--arm", "urscript", "--staging_sheet", sheet, "--out", out)
+    assert answer.code == 0, answer.err
+    assert "dry run: nothing has moved" in answer.out
+    assert "def stackgen_build():" in (out / "build.script").read_text() and sheet.read_text().startswith("<?xml")
