@@ -186,7 +186,7 @@ def test_fit_test_and_sample_from_the_command_line(
     options = yaml.safe_load((CONFIGS / "baselines" / f"{method}.yaml").read_text())
     options["model"]["init_args"]["transformer"] |= {"width": 16, "heads": 2, "feedforward": 32}
     options["trainer"] |= {"max_steps": 2, "enable_progress_bar": False, "enable_model_summary": False}
-    options["trainer"]["callbacks"][1]["init_args"]["every_n_train_steps"] = 2
+    options["trainer"]["callbacks"][-1]["init_args"]["every_n_train_steps"] = 2
     Path("short.yaml").write_text(yaml.safe_dump(options))
     answer = cli("fit", "--config", "short.yaml", "--data.path", compact)
     assert answer.code == 0, answer.err
