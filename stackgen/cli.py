@@ -34,7 +34,7 @@ VERBS: dict[str, Verb] = {
     "check": Verb("stackgen.commands.check", "judge the structures of a file: which stand, which fall"),
     "show": Verb("stackgen.commands.show", "draw the structures of a file, as a picture and in 3-D"),
     "capture": Verb("stackgen.commands.capture", "find the silhouette in a depth frame or a photo of a sketch"),
-    "build": Verb("stackgen.commands.build", "build a structure with a UR5 and parallel jaws, in simulation"),
+    "build": Verb("stackgen.commands.build", "build a structure with a UR5 and parallel jaws, simulated or real"),
     "generate": Verb("stackgen.commands.generate", "make a dataset by deconstruction"),
     "dataset": Verb("stackgen.commands.dataset", "verify, repair, describe, split or export a dataset"),
     "fit": Verb("stackgen.commands.lightning", "train a model"),

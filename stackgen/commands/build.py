@@ -86,6 +86,7 @@ def main(
         raise StackgenError("--noise_mm, --noise_deg and --seed must be at least 0")
     only_simulated = gui or video is not None or noise_mm > 0 or noise_deg > 0 or grasp != "jaws"
     check_options(real, execute, yes, resume, only_simulated)
+    placed = placed_before(out, resume)
     if video is not None:
         check_suffix(video)
     if gui:
@@ -96,7 +97,7 @@ def main(
         else _from_image(from_image, file, inventory, weights, budget, seed)
     )
     physics = _physics(content)
-    wanted, plan = _planned(entries, cell, physics, order, solver, placed_before(out, resume))
+    wanted, plan = _planned(entries, cell, physics, order, solver, placed)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
