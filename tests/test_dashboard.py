@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 from typing import Any
 
@@ -119,8 +120,11 @@ def test_wandb_offline_writes_a_run_that_can_be_synced(
     wandb.finish()  # as at the end of the process
     folder = Path("runs/seen/version_0/wandb")
     (run,) = folder.glob("offline-run-*/*.wandb")
-    content = run.read_bytes()
-    assert all(name.encode() in content for name in ("sample/scenes", "train/gradient_norm", "validation/loss_t1of4"))
+    names = ("sample/scenes", "train/gradient_norm", "validation/loss_t1of4")
+    until = time.monotonic() + 30  # wandb's own process writes it
+    while missing := [name for name in names if name.encode() not in run.read_bytes()]:
+        assert time.monotonic() < until, missing
+        time.sleep(0.2)
 
 
 def test_a_sweep_is_told_after_each_validation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
