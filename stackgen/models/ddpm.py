@@ -63,7 +63,8 @@ class DDPM(WorldMixin, pl.LightningModule):
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """One step of Eq. 3's loss, logged by quarter of the steps too."""
-        losses, t = self.model.loss(batch, self.draws, self._noise_of_step(index, batch["poses"].device))
+        generator = self._noise_of_step(index, batch["poses"].device)
+        losses, t = self.model.loss(batch, self.draws, generator, self.model.config.drop_silhouette)
         loss = losses.mean()
         self.log("train/loss", loss, prog_bar=True)
         if self.trainer.global_step % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]

@@ -32,12 +32,26 @@ class DiffusionConfig:
             Settled stacks hardly vary in y and in rotation; without a bound the rare slanted block
             would be hundreds of standard deviations away.
         variance: Of ancestral sampling's noise: `beta` (paper) or `posterior`, see samplers.ancestral.
+        drop_silhouette: Share of the training samples that are shown an empty picture, so that the model can be
+            guided by itself without the silhouette (Ho & Salimans 2022).
+        guidance: Weight of that guidance while sampling; 1 is none. It needs `drop_silhouette`.
+
+    Raises:
+        StackgenError: If a number is out of its range.
     """
 
     prediction: Literal["epsilon", "v"] = "epsilon"
     clip: float | None = None
     least_std: float = 0.0
     variance: Literal["beta", "posterior"] = "beta"
+    drop_silhouette: float = 0.0
+    guidance: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.drop_silhouette < 1:
+            raise StackgenError(f"diffusion.drop_silhouette must lie in [0, 1), got {self.drop_silhouette}")
+        if self.guidance != 1 and not self.drop_silhouette:
+            raise StackgenError("diffusion.guidance needs diffusion.drop_silhouette, such as 0.1")
 
 
 class PoseDiffusion(nn.Module):
@@ -75,7 +89,11 @@ class PoseDiffusion(nn.Module):
         self.std.copy_(torch.as_tensor(np.asarray(std)).clamp(min=max(self.config.least_std, 1e-6)))
 
     def loss(
-        self, batch: dict[str, Tensor], draws: int = 1, generator: torch.Generator | None = None
+        self,
+        batch: dict[str, Tensor],
+        draws: int = 1,
+        generator: torch.Generator | None = None,
+        drop_silhouette: float = 0.0,
     ) -> tuple[Tensor, Tensor]:
         """Mean squared error per sample and draw, averaged over its real blocks (paper, Eq. 3).
 
@@ -83,6 +101,7 @@ class PoseDiffusion(nn.Module):
             batch: As the DataModule makes it.
             draws: Noise draws of every sample; they share one look at the silhouette.
             generator: Of steps and noise; the global one by default.
+            drop_silhouette: Share of the samples that are shown an empty picture.
 
         Returns:
             Losses and their steps t, both (B * draws,).
@@ -97,7 +116,11 @@ class PoseDiffusion(nn.Module):
         t = torch.randint(1, self.schedule.steps + 1, (len(clean),), generator=generator, device=clean.device)
         noise = torch.randn(clean.shape, generator=generator, device=clean.device, dtype=clean.dtype)
         noisy = self.schedule.diffuse(clean, noise, t)
-        memory = self.denoiser.encode(batch["silhouette"])
+        silhouettes = batch["silhouette"]
+        if drop_silhouette:
+            kept = torch.rand(len(silhouettes), generator=generator, device=clean.device) >= drop_silhouette
+            silhouettes = silhouettes * kept[:, None, None]
+        memory = self.denoiser.encode(silhouettes)
         seen = (
             self._own_estimate(noisy, t, shapes, mask, memory, draws)
             if self.denoiser.config.self_conditioning
@@ -161,6 +184,8 @@ class PoseDiffusion(nn.Module):
         predict = self._predictor(silhouettes, shapes, mask)
         if guide is not None:
             predict = self._guided(predict, guide._predictor(silhouettes, shapes, mask), config)
+        elif config.guidance is not None and config.guidance != 1:
+            predict = self._guided(predict, self._predictor(torch.zeros_like(silhouettes), shapes, mask), config)
         shown = None if callback is None else (lambda t, x: callback(t, x * self.std + self.mean))
         noise = torch.randn((*shapes.shape, POSE), generator=generator, device=generator.device).to(shapes.device)
         assert config.steps and config.spacing
@@ -179,7 +204,8 @@ class PoseDiffusion(nn.Module):
         Raises:
             StackgenError: If they do not fit the model.
         """
-        return sampler.complete(self.schedule.steps, self.config.variance)
+        own = self.config.guidance if self.config.drop_silhouette else None
+        return sampler.complete(self.schedule.steps, self.config.variance, own)
 
     def _predictor(self, silhouettes: Tensor, shapes: Tensor, mask: Tensor) -> Predict:
         """What estimates the clean poses of some scenes; it reads their silhouettes once."""
@@ -199,7 +225,7 @@ class PoseDiffusion(nn.Module):
         return self.denoiser.config.trims
 
     def _guided(self, own: Predict, other: Predict, config: SamplerConfig) -> Predict:
-        """Away from what a weaker version of the model would do (autoguidance, Karras et al. 2024), or towards it."""
+        """Away from what another predictor would do, a weaker model or this one blind, or towards it."""
         assert config.guided is not None and config.guidance is not None
         first, last = (share * self.schedule.steps for share in config.guided)
         weight = config.guidance

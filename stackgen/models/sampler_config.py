@@ -29,7 +29,9 @@ class SamplerConfig:
         variance: Of the noise of `ddpm`: `beta` (paper) or `posterior`, see samplers.ancestral.
         guide: Weights of a weaker version of the model, for autoguidance (Karras et al. 2024): the estimate is
             weak + guidance (strong - weak).
-        guidance: Its weight; 1 is none, 0 leaves the weaker model alone to act there.
+        guidance: Its weight; 1 is none, 0 leaves the weaker model alone to act there. Without a guide a model that
+            was trained with `drop_silhouette` takes that part itself, without the silhouette (classifier-free
+            guidance, Ho & Salimans 2022).
         guided: Where it acts, as shares of T: from which to which t.
 
     Raises:
@@ -70,8 +72,10 @@ class SamplerConfig:
             base = replace(base, eta=None, variance=None)
         return SamplerConfig(**{**asdict(base), **self.given()})
 
-    def complete(self, steps: int, variance: Literal["beta", "posterior"]) -> SamplerConfig:
-        """Nothing null that matters: with the model's T and its `variance`.
+    def complete(
+        self, steps: int, variance: Literal["beta", "posterior"], guidance: float | None = None
+    ) -> SamplerConfig:
+        """Nothing null that matters: with the model's T, its `variance` and its own `guidance`, null if it has none.
 
         Raises:
             StackgenError: If a setting belongs to another kind, or there are more steps than T.
@@ -82,11 +86,16 @@ class SamplerConfig:
                 raise StackgenError(f"sampler.{name} is not for {kind}; set {_OF_KIND[kind]}, or another kind")
         if self.steps is not None and self.steps > steps:
             raise StackgenError(f"sampler.steps: this model has {steps} steps, not {self.steps}")
-        if self.guide is None and (self.guidance is not None or self.guided is not None):
-            raise StackgenError("sampler.guidance and sampler.guided need sampler.guide, weights of a weaker model")
-        defaults = SamplerConfig(kind, steps, SPACING, **({"variance": variance} if kind == "ddpm" else {"eta": 0.0}))
         if self.guide is not None:
-            defaults = replace(defaults, guidance=1.5, guided=(0.0, 1.0))
+            guidance = 1.5
+        elif guidance is None and (self.guidance is not None or self.guided is not None):
+            raise StackgenError(
+                "sampler.guidance and sampler.guided need sampler.guide, weights of a weaker model,"
+                " or a model trained with diffusion.drop_silhouette"
+            )
+        defaults = SamplerConfig(kind, steps, SPACING, **({"variance": variance} if kind == "ddpm" else {"eta": 0.0}))
+        if guidance is not None:
+            defaults = replace(defaults, guidance=guidance, guided=(0.0, 1.0))
         return replace(defaults, **self.given())
 
     @staticmethod
