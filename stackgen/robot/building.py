@@ -62,7 +62,8 @@ def design(generated: Stack, cell: Cell, physics: Physics, strategy: Strategy = 
         stack = roomy if checker.check(roomy).stable else verdict.settled
     finally:
         checker.simulator.close()
-    order = plan_order(stack, approach=TopDownJaws(cell.jaws, physics.cell_size), strategy=strategy)
+    jaws = TopDownJaws(cell.jaws, physics.cell_size, cell.workspace.clearance)
+    order = plan_order(stack, approach=jaws, strategy=strategy)
     if not order.safe and strategy != "greedy":
         raise StackgenError(f"no order is safe: {order.blocked}; --order greedy builds it in the paper's order")
     return Design(stack, verdict.settled, order, strategy)
@@ -187,26 +188,10 @@ def build(
     begin = time.perf_counter()
     with SimulatedArm(cell, plan.stack, noise.disturb(believed), physics, grasp, window) as arm:
         slots = [PlacementError.between(arm.frame(block), believed[block]) for block in range(len(plan.stack))]
-        watch = _Watch(arm)
-        film = camera(arm) if camera else None
-
-        def on_step() -> None:
-            watch.step()
-            if film:
-                film(False)
-
-        def on_done(step: BlockPlan) -> None:
-            watch.done(step)
-            on_block(len(watch.rested))
-
-        arm.on_step = on_step
-        execute(plan, arm, watch.start, watch.release, on_done)
-        arm.wait(_REST)
-        watch.end()
-        seconds = arm.time
-        wall = time.perf_counter() - begin
-        if film:
-            film(True)
+        film = camera(arm) if camera else lambda end: None
+        watch = _watched(plan, arm, on_block, film)
+        seconds, wall = arm.time, time.perf_counter() - begin
+        film(True)
         built = arm.built()
         goals = {step.block: PlacementError.between(arm.frame(step.block), step.goal) for step in plan.blocks}
         tracking, torque = float(np.degrees(arm.tracking_error)), tuple(np.round(arm.torque, 1).tolist())
@@ -232,6 +217,27 @@ def build(
         built,
         plan.stack,
     )
+
+
+def _watched(
+    plan: BuildPlan, arm: SimulatedArm, on_block: Callable[[int], None], film: Callable[[bool], None]
+) -> _Watch:
+    """Carry out a plan and wait until all is at rest; what was seen."""
+    watch = _Watch(arm)
+
+    def on_step() -> None:
+        watch.step()
+        film(False)
+
+    def on_done(step: BlockPlan) -> None:
+        watch.done(step)
+        on_block(len(watch.rested))
+
+    arm.on_step = on_step
+    execute(plan, arm, watch.start, watch.release, on_done)
+    arm.wait(_REST)
+    watch.end()
+    return watch
 
 
 def _block_report(

@@ -67,6 +67,10 @@ class Jaws:
     friction: float = 1.2
     grip_height: float = 0.010
 
+    def tips_above(self, height: float) -> float:
+        """Of the finger tips above the lowest point of a block that is so high [m]: the palm stays above its top."""
+        return max(self.grip_height, height + self.grip_height - self.pad_length)
+
     @property
     def reach(self) -> float:
         """From the flange to the finger tips, the tool centre point [m]."""
@@ -127,7 +131,8 @@ class Workspace:
     """What the arm keeps to.
 
     Args:
-        low, high: Corners of the box in which the finger tips stay [m].
+        low: One corner of the box in which the finger tips stay [m].
+        high: The opposite one [m].
         clearance: Of arm and jaws from everything that they do not handle [m].
         lift: Height of what hangs lowest above everything else on the way [m].
         gap: Room between blocks side by side in the structure [m]: blocks that touch are moved apart by this.

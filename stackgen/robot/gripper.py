@@ -36,7 +36,8 @@ class Gripper:
         host: Of Robotiq's server; the controller by default.
         port: Of Robotiq's server.
         stroke: Opening at position 0 [m].
-        weakest, strongest: Forces at FOR 0 and 255 [N].
+        weakest: Force at FOR 0 [N].
+        strongest: Force at FOR 255 [N].
         speed: Of the jaws, as a share of the largest.
         output: Number of the standard digital output.
         closed: Its level while the jaws are closed.

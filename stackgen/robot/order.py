@@ -20,7 +20,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.geometry import block_vertices, row_intervals
+from stackgen.geometry import block_vertices, centers_of_mass, row_intervals
 from stackgen.protocols import StabilityChecker
 from stackgen.robot.cell import Jaws
 from stackgen.sim.equilibrium import EquilibriumChecker
@@ -157,15 +157,31 @@ class _Judge:
         """Why a step needs a third hand, None where it does not."""
         what = f"step {step + 1} of {len(self.stack)} needs a third hand"
         if not self.reachable(before, block):
-            return f"{what}: blocks placed before are in the way of {self._called(block)}"
-        state = self.state(after)
-        if state.stands:
+            return f"{what}: {self._in_the_way(before, block)}"
+        if self.state(after).stands:
             return None
-        here = _members(after)
-        falling = int(np.flatnonzero(state.falling)[0]) if state.falling.any() else here.index(block)
-        part = self._part(after)
-        why = self.statics.reasons(part, self.statics.equilibrium(part)).get(falling, "falls in the simulator")
-        return f"{what}: once {self._called(block)} is placed, {self._called(here[falling])} would not hold ({why})"
+        return f"{what}: once {self._called(block)} is placed, {self._falls(after, block)}"
+
+    def _in_the_way(self, before: int, block: int) -> str:
+        """Which blocks are in the way of one, and what would fall if they came after it."""
+        alone = [other for other in _members(before) if not self.reachable(1 << other, block)]
+        others = alone or list(_members(before))
+        if not others:
+            return f"the gripper does not get {self._called(block)} to its place"
+        names = " and ".join(map(self._called, others))
+        sentence = f"{names} {'is' if len(others) == 1 else 'are'} in the way of {self._called(block)}"
+        without = before & ~sum(1 << other for other in others) | 1 << block
+        if self.state(without).stands:
+            return sentence
+        return f"{sentence}, and without {'it' if len(others) == 1 else 'them'} {self._falls(without, block)}"
+
+    def _falls(self, members: int, block: int) -> str:
+        """Which of these blocks would not hold, and why; `block` where the judge names none."""
+        here, part = _members(members), self._part(members)
+        reasons = self.statics.reasons(part, self.statics.equilibrium(part))
+        falling = list(reasons) or np.flatnonzero(self.state(members).falling).tolist() or [here.index(block)]
+        first = min(falling, key=lambda i: part.poses[i, 2])  # what lies higher may only lose its support
+        return f"{self._called(here[first])} would not hold ({reasons.get(first, 'falls in the simulator')})"
 
     def _judged(self, part: Stack) -> _State:
         verdict = self.checker.check(part)
@@ -272,19 +288,24 @@ class TopDownJaws:
     def __call__(self, stack: Stack, placed: tuple[int, ...], block: int) -> bool:
         """Whether the way of `block` is free of the blocks `placed`."""
         corners = block_vertices(stack)
-        boxes = self._boxes(stack.poses[block], corners[block])
+        boxes = self._boxes(centers_of_mass(stack)[block], corners[block])
         return not any(
             _covers(corners[other], corners[block]) or any(_above(corners[other], box) for box in boxes)
             for other in placed
         )
 
-    def _boxes(self, pose: Floats, corners: Floats) -> list[tuple[Floats, Floats]]:
-        """Lower and upper corner of what fingers and palm sweep on their way up [cell]."""
+    def _boxes(self, center: Floats, corners: Floats) -> list[tuple[Floats, Floats]]:
+        """Lower and upper corner of what fingers and palm sweep on their way up [cell].
+
+        Args:
+            center: (3,) centre of mass of the block, over which they come down.
+            corners: (V, 3) of the block.
+        """
         jaws, scale = self.jaws, 1 / self.cell_size
         room = self.clearance * scale
-        tips = float(corners[:, 2].min()) + jaws.grip_height * scale
+        tips = float(corners[:, 2].min()) + jaws.tips_above(float(np.ptp(corners[:, 2])) / scale) * scale
         palm = tips + jaws.pad_length * scale
-        middle, out = np.array(pose[:2]), (jaws.opening / 2 + jaws.pad_thickness) * scale
+        middle, out = center[:2], (jaws.opening / 2 + jaws.pad_thickness) * scale
         closed = float(np.ptp(corners[:, 1])) / 2 + BESIDE  # where the pads stop, but for rounding
         finger, across = jaws.pad_width / 2 * scale + room, jaws.palm[1] / 2 * scale + room
         along = jaws.palm[0] / 2 * scale + room

@@ -91,7 +91,7 @@ def wait(stack: Stack, block: int, slot: tuple[float, float, float], cell: Cell,
     in_slot[:3, :3] = turn.as_matrix()
     in_slot[:3, 3] = [-(low[0] + high[0]) / 2, 0.0, -low[2]]
     height = float(high[2] - low[2])
-    tip = np.array([0.0, 0.0, max(jaws.grip_height, height + jaws.grip_height - jaws.pad_length)])
+    tip = np.array([0.0, 0.0, jaws.tips_above(height)])
     tip[0] = (in_slot[:3, :3] @ (shape.center_of_mass * cell_size))[0] + in_slot[0, 3]
     sweep = max(_SWEEP, height + _SWEEP - jaws.pad_length)
     return Waiting(
