@@ -254,7 +254,7 @@ def test_every_parameter_of_the_real_sweep_is_an_option_of_fit(
     assert answer.code == 0, answer.err
     config = yaml.safe_load(answer.out)
     assert config["model"]["init_args"]["schedule"]["kind"] == "cosine"
-    assert config["model"]["init_args"]["denoiser"]["self_conditioning"] is False
+    assert config["model"]["init_args"]["diffusion"]["guidance"] == 1.0
     assert config["name"] == "run"
 
 

@@ -11,7 +11,7 @@ Legend: B scenes, N block tokens, C silhouette tokens, d width.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -20,7 +20,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from stackgen.geometry import PAPER_GRID, Grid, Mask
+from stackgen.geometry import Mask
 from stackgen.models.denoiser import (
     POSE,
     CrossLayer,
@@ -32,7 +32,7 @@ from stackgen.models.denoiser import (
     sinusoids,
 )
 from stackgen.models.network_sampler import NetworkSampler
-from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Stack, StackgenError
+from stackgen.stack import MAX_BLOCKS, Stack, StackgenError
 
 _FORBIDDEN = 1e6  # cost of giving a block another shape's pose
 
@@ -249,20 +249,8 @@ def best_match(cost: Tensor, shapes: Tensor) -> Tensor:
     return torch.from_numpy(found).to(shapes.device)
 
 
-class TransformerSampler(NetworkSampler):
-    """A StackSampler: a learned baseline with its world; arguments as :class:`NetworkSampler` has them."""
-
-    def __init__(
-        self,
-        model: PoseNetwork,
-        catalogue: Catalogue = PAPER_CATALOGUE,
-        grid: Grid = PAPER_GRID,
-        max_blocks: int = MAX_BLOCKS,
-        card: dict[str, Any] | None = None,
-        batch: int = 512,
-    ) -> None:
-        self.model = model.eval()
-        super().__init__(self.model, catalogue, grid, max_blocks, card, batch)
+class TransformerSampler(NetworkSampler[PoseNetwork]):
+    """A StackSampler: a learned baseline with its world."""
 
     def sample_batch(
         self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int

@@ -244,7 +244,7 @@ class PoseDiffusion(nn.Module):
         return same and self.schedule.config == other.schedule.config
 
 
-class DiffusionSampler(NetworkSampler):
+class DiffusionSampler(NetworkSampler[PoseDiffusion]):
     """A StackSampler: the diffusion model with its world.
 
     Args:
@@ -268,8 +268,7 @@ class DiffusionSampler(NetworkSampler):
         batch: int = 512,
         sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
     ) -> None:
-        self.model = model.eval()
-        super().__init__(self.model, catalogue, grid, max_blocks, card, batch)
+        super().__init__(model, catalogue, grid, max_blocks, card, batch)
         self.sampler = self.model.complete(sampler.over(SamplerConfig.of_card(self.card)))
         self.guide = None if self.sampler.guide is None else self._guide(self.sampler.guide)
 

@@ -6,7 +6,7 @@ Legend: B scenes, S shapes, N blocks at most, H x W pixels.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 import torch
@@ -34,8 +34,13 @@ class PoseModel(Protocol):
     @property
     def trims(self) -> bool: ...
 
+    def eval(self) -> Self: ...
 
-class NetworkSampler:
+
+M = TypeVar("M", bound=PoseModel)
+
+
+class NetworkSampler(Generic[M]):
     """What samplers of trained networks share: their world, and questions answered some at a time.
 
     Args:
@@ -47,7 +52,7 @@ class NetworkSampler:
 
     def __init__(
         self,
-        model: PoseModel,
+        model: M,
         catalogue: Catalogue = PAPER_CATALOGUE,
         grid: Grid = PAPER_GRID,
         max_blocks: int = MAX_BLOCKS,
@@ -57,7 +62,7 @@ class NetworkSampler:
         self.catalogue, self.grid, self.max_blocks = catalogue, grid, max_blocks
         self.card = card or {}
         self.batch = batch
-        self._network = model
+        self.model = model.eval()
 
     def _answer(
         self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int, draw: Draw
@@ -70,11 +75,11 @@ class NetworkSampler:
         totals = self._check(silhouettes, counts, num_samples)
         stacks: list[list[Stack]] = []
         scenes = max(1, self.batch // num_samples)
-        device = self._network.mean.device
+        device = self.model.mean.device
         generator = torch.Generator().manual_seed(seed)
         for start in range(0, len(counts), scenes):
             part = slice(start, start + scenes)
-            longest = int(totals[part].max()) if self._network.trims else self.max_blocks
+            longest = int(totals[part].max()) if self.model.trims else self.max_blocks
             shapes, mask = pad_shapes(counts[part], longest)
             poses = draw(
                 torch.from_numpy(np.ascontiguousarray(silhouettes[part], dtype=np.float32)).to(device),
