@@ -1,8 +1,9 @@
-"""Callbacks that every module shares: averaged weights, quality of samples, throughput."""
+"""Callbacks that every module shares: averaged and compiled weights, quality of samples, throughput."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,9 @@ from stackgen.geometry import PAPER_GRID, Grid
 from stackgen.metrics import SCENE_METRICS, SceneMetric, SceneScore
 from stackgen.protocols import StabilityChecker, StackSampler, Verdict
 from stackgen.stack import PAPER_CATALOGUE, Stack, StackgenError
+
+Part = tuple[float, float]
+"""A sum, and the weight that it is to be divided by."""
 
 RAW_WEIGHTS = "raw_state_dict"
 """Key of the not averaged weights in a checkpoint; its `state_dict` holds the averaged ones."""
@@ -49,6 +53,50 @@ class StartFrom(pl.Callback):
             raise StackgenError(f"StartFrom: {self.weights} does not fit the model of the configuration")
         if missing:
             print(f"StartFrom: {self.weights} has no {', '.join(missing)}: begun afresh")
+
+
+class Compile(pl.Callback):
+    """Compiles parts of the network with torch.compile for the training steps, in place: weights keep their names.
+
+    Validation and sampling see other sizes and modes, each a compilation of its own; they run as written.
+
+    Args:
+        parts: Of the training module, by their names in it.
+        backend: Of torch.compile; `inductor` asks for a C++ compiler on a CPU.
+        mode: Of that backend, such as `reduce-overhead` or `max-autotune`.
+        dynamic: Whether one compilation is for all sizes; null compiles for the first size, and for all at the second.
+    """
+
+    def __init__(
+        self,
+        parts: Sequence[str] = ("model.denoiser",),
+        backend: str = "inductor",
+        mode: str | None = None,
+        dynamic: bool | None = None,
+    ) -> None:
+        self.parts = tuple(parts)
+        self.options: dict[str, Any] = {"backend": backend, "mode": mode, "dynamic": dynamic}
+
+    def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Mark them; each is compiled when it is first called."""
+        known = dict(pl_module.named_modules())
+        for part in self.parts:
+            if part not in known:
+                kin = [name for name in known if name and name.count(".") < 2]
+                raise StackgenError(f"Compile: {type(pl_module).__name__} has no part {part!r}; try {', '.join(kin)}")
+            known[part].compile(**self.options)
+
+    def on_validation_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Run as written."""
+        torch.compiler.set_stance("force_eager")
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Run what is compiled."""
+        torch.compiler.set_stance("default")
+
+    def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
+        """Leave nothing behind for what runs next in this process."""
+        torch.compiler.set_stance("default")
 
 
 class EMA(pl.Callback):
@@ -219,8 +267,9 @@ class SampleQuality(pl.Callback):
         self._batches = []
         start = time.perf_counter()
         stacks = self.draw(sampler, scenes, trainer.global_rank)
-        rate = len(scenes) * self.num_samples / (time.perf_counter() - start)
-        values = {**self.measure(sampler, scenes, stacks), "stacks_per_second": rate}
+        rate = len(scenes) * self.num_samples, time.perf_counter() - start
+        parts = {**self.measure(sampler, scenes, stacks), "stacks_per_second": rate}
+        values = _over_processes(trainer, parts)  # the same on all of them
         pl_module.log_dict({f"sample/{name}": value for name, value in values.items()}, sync_dist=True)
         if self.num_pictures and trainer.is_global_zero:
             firsts, shown = scenes[: self.num_pictures], [samples[0] for samples in stacks[: self.num_pictures]]
@@ -232,11 +281,11 @@ class SampleQuality(pl.Callback):
         silhouettes, counts = np.stack([s.silhouette for s in scenes]), np.stack([s.counts for s in scenes])
         return sampler.sample_batch(silhouettes, counts, self.num_samples, batch_seed(self.seed, 0, rank))
 
-    def measure(self, sampler: StackSampler, scenes: list[Scene], stacks: list[list[Stack]]) -> dict[str, float]:
-        """The figures of some scenes, by name; NaN where one does not exist."""
+    def measure(self, sampler: StackSampler, scenes: list[Scene], stacks: list[list[Stack]]) -> dict[str, Part]:
+        """The figures of some scenes, by name, each as a sum and the weight that it is to be divided by."""
         scores = [r.score for r in judge(scenes, stacks, self.checker or _NoPhysics(), _grid(sampler))]
         names = SCENE_METRICS if self.checker else ("diversity", "front_iou_before_physics")
-        return {name: _mean(SCENE_METRICS[name], scores) for name in names}
+        return {name: _sum(SCENE_METRICS[name], scores) for name in names}
 
 
 def _grid(sampler: StackSampler) -> Grid:
@@ -250,9 +299,16 @@ class _NoPhysics:
         return Verdict(True, np.zeros(len(stack), bool), np.zeros(len(stack)), stack)
 
 
-def _mean(metric: SceneMetric, scores: list[SceneScore]) -> float:
+def _sum(metric: SceneMetric, scores: list[SceneScore]) -> Part:
     totals, weights = zip(*(metric(score) for score in scores), strict=True)
-    return sum(totals) / sum(weights) if sum(weights) else float("nan")
+    return sum(totals), sum(weights)
+
+
+def _over_processes(trainer: pl.Trainer, parts: dict[str, Part]) -> dict[str, float]:
+    """The mean of each figure, all processes' scenes counting alike; NaN where it does not exist."""
+    local = torch.tensor(list(parts.values()), device=trainer.strategy.root_device)
+    sums = trainer.strategy.reduce(local, reduce_op="sum").tolist()
+    return {name: total / weight if weight else float("nan") for name, (total, weight) in zip(parts, sums, strict=True)}
 
 
 class Throughput(pl.Callback):

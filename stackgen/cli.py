@@ -60,6 +60,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         130 when interrupted, 70 for a bug of ours (with its traceback).
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments[:1] == ["help"] and len(arguments) > 1:
+        arguments = [*arguments[1:], "--help"]
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         return _talk(usage())
     if arguments[0] in ("-V", "--version", "version"):

@@ -37,7 +37,8 @@ class Grid:
     were seen to do.
 
     Args:
-        width, height: Size of the design grid [cell].
+        width: Of the design grid [cell].
+        height: Of the design grid [cell].
         image_size: Edge of the silhouette [pixel].
         pixels_per_cell: Scale.
         ground_margin: Rows of pixels under the ground line.

@@ -166,15 +166,20 @@ def stands(tmp_path: Path) -> Path:
 @pytest.fixture(scope="session")
 def towers_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A dataset of towers of one to three cubes: 48 to train on, 12 to validate, 12 to test."""
+    return write_towers(tmp_path_factory.mktemp("dataset"), {"train": 48, "validation": 12, "test": 12})
+
+
+def write_towers(folder: Path, sizes: dict[str, int]) -> Path:
+    """Write a dataset of towers of one to three cubes, a shard for each split."""
     from stackgen.data.shards import Manifest, Sample, write_shard
     from stackgen.geometry import PAPER_GRID, silhouette
     from stackgen.sim.physics import Physics
     from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE
 
-    folder = tmp_path_factory.mktemp("dataset")
+    folder.mkdir(exist_ok=True)
     rng = np.random.default_rng(0)
     entries = []
-    for number, (split, size) in enumerate((("train", 48), ("validation", 12), ("test", 12))):
+    for number, (split, size) in enumerate(sizes.items()):
         samples = []
         for i in range(size):
             stack = TowerSampler._tower(np.array([1 + i % 3, 0, 0, 0]), rng)

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from stackgen._lightning import pl
-from stackgen.callbacks import EMA, RAW_WEIGHTS, SampleQuality, Throughput
+from stackgen.callbacks import EMA, RAW_WEIGHTS, Compile, SampleQuality, Throughput
 from stackgen.data.arrays import Batch, StackArrays
 from stackgen.geometry import Mask, silhouette
 from stackgen.protocols import Verdict
@@ -108,6 +108,53 @@ def test_accumulated_gradients_are_one_update(tmp_path: Path) -> None:
     ema, module = EMA(0.5, warmup=False), Module()
     trainer_for(tmp_path, [ema], accumulate_grad_batches=4).fit(module, batches(8))
     assert ema.updates == 2
+
+
+class Layer(torch.nn.Linear):
+    """Code of ours: torch.compile leaves PyTorch's own layers to those who call them."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x).tanh()
+
+
+class Layered(Module):
+    """A part to be compiled."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = Layer(2, 2)
+
+    def training_step(self, batch: Any, batch_idx: int) -> Tensor:
+        return self.layer(self.weight).square().sum()
+
+    def validation_step(self, batch: Any, batch_idx: int) -> None:
+        self.compiled_before = frames()
+        self.layer(self.weight.repeat(5, 1))
+        self.compiled_after = frames()
+
+
+def frames() -> int:
+    """Pieces of code that torch.compile has taken up in this process."""
+    return torch._dynamo.utils.counters["frames"]["ok"]
+
+
+def test_compiled_parts_train_as_they_would_and_keep_their_names(tmp_path: Path) -> None:
+    found, ways = [], list[list[pl.Callback]]([[], [Compile(["layer"], backend="eager")]])
+    for callbacks in ways:
+        torch.manual_seed(0)
+        module, before = Layered(), frames()
+        trainer_for(tmp_path, callbacks).fit(module, batches(4), batches(1))
+        found.append((module.state_dict(), frames() - before))
+        assert module.compiled_before == module.compiled_after  # validation runs as written
+    (plain, none), (compiled, some) = found
+    assert none == 0 < some
+    assert list(plain) == list(compiled)
+    assert all(torch.equal(plain[name], compiled[name]) for name in plain)
+
+
+def test_a_part_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(StackgenError, match=r"Layered has no part 'model.denoiser'; try layer"):
+        trainer_for(tmp_path, [Compile()]).fit(Layered(), batches(1))
 
 
 def test_checkpoints_hold_the_average_and_a_resumed_fit_is_the_uninterrupted_one(tmp_path: Path) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -80,6 +82,15 @@ def test_a_column_shows_target_generated_and_settled() -> None:
     assert targets.sum() >= 2 * settled
 
 
+def test_scenes_that_do_not_fit_beside_each_other_go_below(tmp_path: Path) -> None:
+    scene = Scene("a", silhouette(cube()), np.array([1, 0, 0, 0]))
+    sheets = [silhouette_sheet([scene] * n, [cube()] * n, [None] * n) for n in (4, 5, 8)]
+    four, five, eight = (sheet.shape for sheet in sheets)
+    assert four[1] == five[1] == eight[1] and four[0] < five[0] == eight[0]
+    ink = [int((sheet[:, 122:] == (40, 42, 48)).all(axis=-1).sum()) for sheet in sheets]
+    assert ink[0] // 4 == ink[1] // 5 == ink[2] // 8 == 8 * int(silhouette(cube()).sum())
+
+
 def test_pictures_go_to_every_logger(tmp_path: Path) -> None:
     loggers: list[Any] = [CSVLogger(tmp_path, "a", "b"), TensorBoardLogger(tmp_path, "t", "")]
     trainer = trainer_for(tmp_path, [], logger=loggers)
@@ -103,9 +114,18 @@ def test_tensorboard_has_all_curves_pictures_and_the_configuration(
     tags = events.Tags()
     assert set(tags["scalars"]) >= CURVES
     assert tags["images"] == ["sample/scenes"]
+    (text,) = events.Tensors("configuration/text_summary")
+    assert b"width: 32" in text.tensor_proto.string_val[0] and b"sha256" in text.tensor_proto.string_val[0]
     assert len(events.Scalars("train/gradient_norm")) == 6
     assert all(0 <= event.value <= 1 for event in events.Scalars("sample/stability"))
     assert "width: 32" in Path("runs/seen/version_0/hparams.yaml").read_text()
+
+
+def records_of(run: Path) -> list[dict[str, Any]]:
+    """What wandb's own reader finds in an offline run; none while the file has just been begun."""
+    command = [str(Path(sys.executable).with_name("wandb")), "leet", "inspect", "--json", str(run)]
+    done = subprocess.run(command, capture_output=True, text=True, stdin=subprocess.DEVNULL, timeout=120)
+    return [json.loads(line) for line in done.stdout.splitlines()]
 
 
 @pytest.mark.slow
@@ -120,11 +140,25 @@ def test_wandb_offline_writes_a_run_that_can_be_synced(
     wandb.finish()  # as at the end of the process
     folder = Path("runs/seen/version_0/wandb")
     (run,) = folder.glob("offline-run-*/*.wandb")
-    names = ("sample/scenes", "train/gradient_norm", "validation/loss_t1of4")
-    until = time.monotonic() + 30  # wandb's own process writes it
-    while missing := [name for name in names if name.encode() not in run.read_bytes()]:
-        assert time.monotonic() < until, missing
+    until = time.monotonic() + 60  # wandb's own process writes it
+    records: list[dict[str, Any]] = []
+    while "exit" not in {record["type"] for record in records}:
+        assert time.monotonic() < until, "wandb does not end"
         time.sleep(0.2)
+        records = records_of(run)
+    rows = [record["history"]["item"] for record in records if record["type"] == "history"]
+    assert {name for row in rows for name in row} >= CURVES
+    (picture,) = [row for row in rows if "sample/scenes.filenames" in row]
+    assert picture["trainer/global_step"] == 6
+    (media,) = run.parent.glob("files/media/images/sample/scenes_*.png")
+    assert media.read_bytes() == Path("runs/seen/version_0/pictures/sample/scenes/000006.png").read_bytes()
+    (artifact,) = [record["artifact"] for record in records if record["type"] == "artifact"]
+    (file,) = artifact["manifest"]["contents"]
+    assert artifact["type"] == "model" and file["path"] == "model.ckpt"
+    kept = Path(file["local_path"])
+    assert kept.parent == (tmp_path / "runs/seen/version_0/checkpoints").resolve() and kept.is_file()
+    (config,) = [json.dumps(record) for record in records if record["type"] == "config"]
+    assert "width" in config and "sha256" in config
 
 
 def test_a_sweep_is_told_after_each_validation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pytest
 import torch
 import yaml
 
+from stackgen.models.optimization import OptimizerConfig, learning_rate_share
 from stackgen.runs import last_checkpoint
 from stackgen.stacks_file import read_stacks
 from stackgen.weights import load_sampler
@@ -57,6 +59,65 @@ def test_each_run_has_its_own_folder_with_its_configuration(cli: Cli, config: Pa
             rows = list(csv.DictReader(file))
         assert any(row["train/loss"] for row in rows) and any(row["validation/loss"] for row in rows)
         assert steps(folder / "checkpoints" / "last.ckpt") == 4
+
+
+def test_a_run_is_written_down_whatever_its_loggers(cli: Cli, config: Path) -> None:
+    for number in range(2):
+        answer = cli("fit", "--config", config, "--trainer.logger", "false")
+        assert answer.code == 0, answer.err
+        folder = Path(f"runs/tiny/version_{number}")
+        assert sorted(path.name for path in folder.iterdir()) == ["checkpoints", "config.yaml", "run.json"]
+    assert [path.name for path in Path("runs").iterdir()] == ["tiny"]
+
+
+def test_a_checkpoint_alone_goes_on_with_its_run_s_settings(cli: Cli, config: Path) -> None:
+    assert cli("fit", "--config", config, "--trainer.gradient_clip_val", 0.5, "--dashboard", "none").code == 0
+    answer = cli("fit", "--ckpt_path", "runs/tiny/version_0/checkpoints/last.ckpt", "--trainer.max_epochs", 3)
+    assert answer.code == 0, answer.err
+    first, second = (yaml.safe_load(Path(f"runs/tiny/version_{n}/config.yaml").read_text()) for n in (0, 1))
+    assert second.pop("ckpt_path") == "runs/tiny/version_0/checkpoints/last.ckpt"
+    assert second["trainer"].pop("max_epochs") == 3
+    del first["ckpt_path"], first["trainer"]["max_epochs"]
+    assert second == first
+    assert steps(Path("runs/tiny/version_1/checkpoints/last.ckpt")) == 9
+
+
+FAST = """
+trainer:
+  precision: bf16-mixed
+  accumulate_grad_batches: 2
+  max_epochs: 3
+  callbacks: [{{class_path: stackgen.callbacks.Compile, init_args: {{backend: {backend}}}}},
+              {{class_path: stackgen.callbacks.EMA}}]
+"""
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    "backend",
+    [
+        "aot_eager",
+        pytest.param(
+            "inductor",
+            marks=[pytest.mark.slow, pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")],
+        ),
+    ],
+)
+def test_half_precision_accumulation_and_compilation_are_settings(backend: str, cli: Cli, config: Path) -> None:
+    """48 samples are three batches of 16 and two steps an epoch; schedule and average go by steps."""
+    Path("fast.yaml").write_text(FAST.format(backend=backend))
+    answer = cli("fit", "--config", config, "--config", "fast.yaml", "--dashboard", "none")
+    assert answer.code == 0, answer.err
+    checkpoint = torch.load("runs/tiny/version_0/checkpoints/last.ckpt", weights_only=True)
+    assert checkpoint["global_step"] == checkpoint["callbacks"]["EMA"]["updates"] == 6
+    assert {t.dtype for t in checkpoint["state_dict"].values() if t.is_floating_point()} == {torch.float32}
+    with Path("runs/tiny/version_0/metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    course = [learning_rate_share(step, 6, OptimizerConfig(warmup=2)) for step in range(6)]
+    rates = [float(row["train/learning_rate"]) / 0.001 for row in rows if row["train/learning_rate"]]
+    assert rates == pytest.approx(course, rel=1e-5)
+    assert cli("export", "runs/tiny", "--out", "tiny.safetensors").code == 0
+    assert load_sampler("tiny.safetensors") is not None
 
 
 def test_the_saved_configuration_runs_again(cli: Cli, config: Path) -> None:
@@ -138,6 +199,8 @@ def test_protocol_of_a_checkpoint_leaves_figures_for_both_lists_and_the_ceiling(
     assert [row["scenes"] for row in content["rows"]] == [12, 12, 12]
     assert content["rows"][2]["metrics"]["stability"]["value"] == 1  # the ceiling: towers stand
     assert len(list(Path("runs/run/test_0").glob("scenes-*.csv"))) == 3
+    run = json.loads(Path("runs/run/test_0/run.json").read_text())
+    assert run["dataset"]["path"] == str(towers_dataset) and len(run["dataset"]["sha256"]) == 64
 
 
 def test_predict_writes_a_stacks_file_for_each_scene(

@@ -36,7 +36,7 @@ class SilhouetteMLP(WorldMixin, pl.LightningModule):
         return loss
 
     def validation_step(self, batch: dict[str, Tensor], index: int) -> None:
-        self.log("validation/loss", self.loss(batch), batch_size=len(batch["mask"]), sync_dist=True)
+        self.log_mean("validation/loss", self.loss(batch), len(batch["mask"]))
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return torch.optim.AdamW(self.parameters(), lr=self.learning_rate)

@@ -61,9 +61,9 @@ class PoseBaseline(WorldMixin, pl.LightningModule):
         generator = torch.Generator(device=batch["poses"].device).manual_seed(index)
         loss, parts = self._loss(batch, generator)
         size = len(batch["mask"])
-        self.log("validation/loss", loss, prog_bar=True, batch_size=size, sync_dist=True)
+        self.log_mean("validation/loss", loss, size, prog_bar=True)
         for name, part in parts.items():
-            self.log(f"validation/{name}", part, batch_size=size, sync_dist=True)
+            self.log_mean(f"validation/{name}", part, size)
 
     def configure_optimizers(self) -> Any:
         """AdamW and its learning-rate course."""

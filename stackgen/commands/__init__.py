@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -15,6 +14,7 @@ from jsonargparse import ArgumentError, ArgumentParser, DefaultHelpFormatter, Na
 from jsonargparse.typing import register_type
 from omegaconf.errors import OmegaConfBaseException
 
+from stackgen.commands.hints import did_you_mean
 from stackgen.stack import Catalogue, StackgenError
 
 
@@ -34,12 +34,15 @@ CONFIG_HELP = "YAML file with these options, or with a section named like the ve
 
 
 class HelpFormatter(DefaultHelpFormatter, argparse.RawDescriptionHelpFormatter):
-    """Leaves the line breaks of the example under a help alone, and names a catalogue's shapes."""
+    """Leaves the line breaks of the example under a help alone; names shapes and types as a person would."""
 
     def _get_help_string(self, action: argparse.Action) -> str:
         if isinstance(action.default, Mapping) and "shapes" in action.default.get("init_args", ()):
             return f"{action.help} (default: {', '.join(_catalogue(action.default).names)})"
         return super()._get_help_string(action)
+
+    def _expand_help(self, action: argparse.Action) -> str:
+        return re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", super()._expand_help(action))
 
 
 @dataclass(frozen=True)
@@ -97,11 +100,18 @@ class Command:
         parser.add_argument(*CONFIG_FLAGS, action="config", help=CONFIG_HELP)
         if self.files:
             nargs = "+" if self.files.many else "?" if self.files.optional else None
+            # A default of its own would take the place of what a configuration file says.
+            no_default: dict[str, Any] = {"default": argparse.SUPPRESS} if self.files.optional else {}
             parser.add_argument(
-                self.files.parameter, nargs=nargs, type=Path, metavar=self.files.metavar, help=self.files.help
+                self.files.parameter,
+                nargs=nargs,
+                type=Path,
+                metavar=self.files.metavar,
+                help=self.files.help,
+                **no_default,
             )
         if self.settings:
-            parser.add_class_arguments(self.settings[1], sub_configs=True)
+            parser.add_class_arguments(self.settings[1], sub_configs=True, as_group=False)
         for name, text in self.flags.items():
             parser.add_argument(f"--{name}", action="store_true", help=text)
         special: set[str | int] = set(self.flags)
@@ -109,7 +119,9 @@ class Command:
             special.add(self.files.parameter)
         if self.settings:
             special.add(self.settings[0])
-        parser.add_function_arguments(self.function, skip=special, as_positional=False, sub_configs=True)
+        parser.add_function_arguments(
+            self.function, skip=special, as_group=False, as_positional=False, sub_configs=True
+        )
         return parser
 
     def run(self, argv: Sequence[str]) -> int | None:
@@ -129,8 +141,14 @@ def epilog(example: str) -> str:
     return "\n".join(["example:", *(f"  {line.strip()}" for line in example.strip().splitlines())])
 
 
-def parse(parser: ArgumentParser, verb: str, argv: Sequence[str]) -> Namespace:
+def parse(parser: ArgumentParser, verb: str, argv: Sequence[str], own: ArgumentParser | None = None) -> Namespace:
     """Parse, or say in one line what was wrong and where to look.
+
+    Args:
+        parser: Of the arguments.
+        verb: Whose they are.
+        argv: The arguments.
+        own: The parser that knows the verb's options, if the other one only knows verbs.
 
     Raises:
         StackgenError: On an unknown option or key, a missing or ill-typed value, a broken YAML file.
@@ -138,8 +156,9 @@ def parse(parser: ArgumentParser, verb: str, argv: Sequence[str]) -> Namespace:
     try:
         return parser.parse_args(list(argv))
     except (ArgumentError, OmegaConfBaseException) as error:
+        text = str(error).replace(f"required: {verb}.", "required: ")
         raise StackgenError(
-            f"{_shorten(str(error))}{_hint(parser, str(error))}; see `stackgen {verb} --help`"
+            f"{_shorten(text)}{did_you_mean(own or parser, text)}; see `stackgen {verb} --help`"
         ) from error
 
 
@@ -185,7 +204,7 @@ def _section(file: Path, verb: str) -> str | None:
 
 _NOISE = re.compile(
     r"(- )?(Does not validate against any of the Union|Subtypes:|Errors:|Given value|Expected a <class 'NoneType'>"
-    r"|Expected a path but)"
+    r"|Expected a path but|Subclass types expect|a class path|a dict with)"
 )
 
 
@@ -196,18 +215,6 @@ def _shorten(message: str, limit: int = 300) -> str:
     'data.mode: Expected a float. Got value: q'
     """
     lines = [line.strip() for line in message.splitlines() if line.strip() and not _NOISE.match(line.strip())]
-    text = " ".join(line.removeprefix("- ") for line in lines)
+    text = " ".join(dict.fromkeys(line.removeprefix("- ") for line in lines))  # each member of a union says it
     text = re.sub(r"""^Parser key ["'](.*?)["']""", r"\1", re.sub(r"<class '([\w.]+)'>", r"\1", text))
     return text if len(text) <= limit else f"{text[:limit].rstrip()} ..."
-
-
-def _hint(parser: ArgumentParser, message: str) -> str:
-    """`did you mean` for an option that does not exist."""
-    prefix = "unrecognized arguments: "
-    if not message.startswith(prefix):
-        return ""
-    options = [option for action in parser._actions for option in action.option_strings]
-    near = difflib.get_close_matches(
-        message.removeprefix(prefix).split()[0].partition("=")[0], options, n=1, cutoff=0.7
-    )
-    return f" (did you mean {near[0]}?)" if near else ""

@@ -8,6 +8,7 @@ import logging
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +18,7 @@ os.environ.setdefault("WANDB_SILENT", "true")
 
 import torch
 import yaml
-from jsonargparse import ArgumentParser, set_parsing_settings
+from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.cli import ArgsType, LightningArgumentParser, LightningCLI, SaveConfigCallback
@@ -26,7 +27,7 @@ from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger, Wand
 from stackgen.callbacks import SampleQuality, Throughput
 from stackgen.commands import CONFIG_FLAGS, HelpFormatter, epilog, option_values, own_sections, parse
 from stackgen.commands.protocol import WeightsUnderTest, run_protocol, write_predictions
-from stackgen.dashboard import StepFigures
+from stackgen.dashboard import CheckpointArtifact, StepFigures, log_configuration
 from stackgen.data.datamodule import TESTSET, StackDataModule
 from stackgen.data.physics import warn_of_other_physics
 from stackgen.data.shards import manifest_sha256
@@ -49,7 +50,9 @@ stackgen fit --config configs/model/ddpm-small.yaml --data.path data/paper --ckp
 
 Dashboard = Literal["wandb", "wandb-offline", "tensorboard", "none"]
 
-_FOLDER = "STACKGEN_RUN_FOLDER"  # tells the other processes of a distributed run where the first one writes
+_FOLDER = "STACKGEN_RUN_FOLDER"  # tells the processes that the first one starts where it writes
+_RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "SLURM_PROCID")
+"""What launchers number processes or machines by; all are 0, where they are set, for the first process alone."""
 
 
 def run(verb: str, argv: Sequence[str]) -> None:
@@ -59,6 +62,7 @@ def run(verb: str, argv: Sequence[str]) -> None:
     set_parsing_settings(omegaconf_absolute_to_relative_paths=True)  # else `${...}` starts at the subcommand
     for chatty in ("lightning.pytorch", "lightning.fabric"):  # seeds, devices and advertisements
         logging.getLogger(chatty).setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", ".*treespec, LeafSpec.*", FutureWarning)  # Lightning calls what PyTorch renames
     interrupt = signal.getsignal(signal.SIGINT)
     try:
         _command_line(StackgenCLI, [verb, *own_sections(verb, argv)])
@@ -134,7 +138,7 @@ class StackgenCLI(LightningCLI):
         assert isinstance(args, list)
         verb, *rest = args
         rest = _complete(verb, rest)
-        self.config = parse(parser, verb, [verb, *rest])
+        self.config = parse(parser, verb, [verb, *rest], self._parser(verb))
         config = self.config[verb]
         if config.get("model") is None:
             raise StackgenError(f"no model: give one, e.g. stackgen {verb} --config configs/model/ddpm-small.yaml")
@@ -154,12 +158,13 @@ class StackgenCLI(LightningCLI):
         if not config.fast_dev_run:
             if verb in ("fit", "validate"):
                 manifest = self.datamodule.manifest  # a mistake in the path must not leave an empty run behind
-                if not int(os.environ.get("LOCAL_RANK", 0)):
+                if _is_first_process():
                     made = manifest.get("physics")
                     here = Physics.of_world(made).to_json()
                     warn_of_other_physics(f"dataset {self.datamodule.path}", made, here)
             kind = "version" if verb == "fit" else verb
             self.folder = _run_folder(self._get(self.config, "name"), Path(config.default_root_dir), kind)
+            self.save_config_kwargs = {"folder": self.folder}
             if config.logger in (None, True):
                 dashboard: Dashboard = self._get(self.config, "dashboard") if verb == "fit" else "none"
                 kwargs["logger"] = _loggers(self.folder, dashboard)
@@ -187,8 +192,9 @@ class StackgenCLI(LightningCLI):
                 "predict samples with weights: leave --model out and give --ckpt_path or --model.weights"
             )
         self.trainer.predict(model, datamodule=datamodule, return_predictions=False, **options)
-        if self.folder is not None:
-            write_predictions(model.predictions, self.folder)
+        folder = self.trainer.strategy.broadcast(self.folder)
+        if folder is not None:
+            write_predictions(model.predictions, folder)
 
     def after_validate(self) -> None:
         """Leave the figures behind."""
@@ -205,22 +211,32 @@ class StackgenCLI(LightningCLI):
 
 
 class SaveRun(SaveConfigCallback):
-    """Writes down what made a run, also for its dashboards: its configuration; code, data and command in `run.json`."""
+    """Writes down what made a run, also for its dashboards: its configuration; code, data and command in `run.json`.
+
+    Args:
+        parser: Of the verb.
+        config: What it made of the command line.
+        folder: Of the run, whatever its loggers are.
+    """
+
+    def __init__(self, parser: LightningArgumentParser, config: Namespace, folder: Path) -> None:
+        super().__init__(parser, config, save_to_log_dir=False)
+        self.folder = folder
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """On the first process, once the folder is there."""
-        config = yaml.safe_load(self.parser.dump(self.config, skip_none=False))
+        text = self.parser.dump(self.config, skip_none=False)
+        write_atomically(self.folder / "config.yaml", text.encode())
         facts: dict[str, Any] = {"code": code_version(), "command": ["stackgen", *sys.argv[1:]]}
         data = getattr(trainer, "datamodule", None)
-        if isinstance(data, StackDataModule) and stage in ("fit", "validate"):
-            manifest = data.manifest
-            facts["dataset"] = {"path": data.path, "name": manifest["name"], "sha256": manifest_sha256(manifest)}
+        if isinstance(data, StackDataModule):
+            asked = stage in ("test", "predict")
+            path, manifest = (data.test_path, data.test_manifest) if asked else (data.path, data.manifest)
+            facts["dataset"] = {"path": path, "name": manifest["name"], "sha256": manifest_sha256(manifest)}
+        write_atomically(self.folder / "run.json", (json.dumps(facts, indent=1) + "\n").encode())
         for logger in trainer.loggers:
-            if isinstance(logger, CSVLogger):
-                path = Path(logger.log_dir) / "run.json"
-                write_atomically(path, (json.dumps(facts, indent=1) + "\n").encode())
-            else:
-                logger.log_hyperparams({**config, "run": facts})
+            if not isinstance(logger, CSVLogger):
+                log_configuration(logger, {**yaml.safe_load(text), "run": facts})
 
 
 def _parser_options() -> dict[str, Any]:
@@ -255,7 +271,8 @@ def _complete(verb: str, arguments: list[str]) -> list[str]:
     if not found:
         return arguments
     saved = yaml.safe_load(found[-1].read_text())
-    return ["--config", yaml.safe_dump({key: saved[key] for key in ("name", "model", "data")}), *arguments]
+    asked = [key for key in saved if key != "ckpt_path"] if verb == "fit" else ["name", "model", "data"]
+    return ["--config", yaml.safe_dump({key: saved[key] for key in asked}), *arguments]
 
 
 def _is_protocol(value: str) -> bool:
@@ -292,10 +309,15 @@ def _check_checkpoint(path: Path) -> None:
         raise StackgenError(f"{path} is not a checkpoint of `stackgen fit`: it says nothing of its world")
 
 
+def _is_first_process() -> bool:
+    """Also before Lightning, which numbers the processes, is there to be asked."""
+    return not any(int(os.environ.get(name, 0)) for name in _RANKS)
+
+
 def _run_folder(name: str, root: Path, kind: str) -> Path:
-    """A new folder; in a distributed run's other processes, that of the first."""
-    if int(os.environ.get("LOCAL_RANK", 0)) and _FOLDER in os.environ:
-        return Path(os.environ[_FOLDER])
+    """A new folder, made by the first process of a distributed run; the others write nothing, or ask it first."""
+    if not _is_first_process():
+        return Path(os.environ.get(_FOLDER, root / name))
     folder = new_run(name, root, kind)
     os.environ[_FOLDER] = str(folder)
     return folder
@@ -306,12 +328,13 @@ def _loggers(folder: Path, dashboard: Dashboard) -> list[Logger]:
     csv = CSVLogger(folder.parent.parent, folder.parent.name, folder.name)
     if dashboard == "none" or in_a_sweep():
         return [csv]
-    _ = csv.experiment  # before others put files into its folder
+    if _is_first_process():
+        _ = csv.experiment  # before others put files into its folder
     if dashboard == "tensorboard":
         return [csv, TensorBoardLogger(folder, "", "", default_hp_metric=False)]
     offline = dashboard == "wandb-offline" or not os.environ.get("WANDB_API_KEY")
     name = f"{folder.parent.name}-{folder.name}"
-    wandb = WandbLogger(name, folder, project="stackgen", offline=offline, log_model=not offline)
+    wandb = WandbLogger(name, folder, project="stackgen", offline=offline)
     getattr(wandb, "_wandb_init", {}).pop("anonymous", None)  # wandb warns about it, whatever its value
     return [csv, wandb]
 
@@ -319,7 +342,8 @@ def _loggers(folder: Path, dashboard: Dashboard) -> list[Logger]:
 def _watched(callbacks: list[Callback]) -> list[Callback]:
     """The callbacks, with those that a dashboard lives on; in a sweep, with the one that tells it."""
     found = list(callbacks)
-    found += [kind() for kind in (StepFigures, Throughput) if not any(isinstance(c, kind) for c in found)]
+    kinds = (StepFigures, Throughput, CheckpointArtifact)
+    found += [kind() for kind in kinds if not any(isinstance(c, kind) for c in found)]
     return [*found, TellSweep()] if in_a_sweep() else found
 
 

@@ -51,9 +51,9 @@ class BlockListCNN(WorldMixin, pl.LightningModule):
         features, truth = self.model.features(batch["silhouette"]), batch["counts"]
         loss, hits = self._loss(features, truth), self._hits(features, truth)
         size = len(hits)
-        self.log("validation/loss", loss, prog_bar=True, batch_size=size, sync_dist=True)
-        self.log("validation/exact", hits[:, 0].float().mean(), prog_bar=True, batch_size=size, sync_dist=True)
-        self.log("validation/top3", hits.any(-1).float().mean(), batch_size=size, sync_dist=True)
+        self.log_mean("validation/loss", loss, size, prog_bar=True)
+        self.log_mean("validation/exact", hits[:, 0].float().mean(), size, prog_bar=True)
+        self.log_mean("validation/top3", hits.any(-1).float().mean(), size)
 
     def _loss(self, features: Tensor, truth: Tensor) -> Tensor:
         """Mean cross-entropy of the true lists (B, S)."""

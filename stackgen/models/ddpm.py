@@ -82,15 +82,18 @@ class DDPM(WorldMixin, pl.LightningModule):
         """The same loss on held-out stacks, with the same noise every time."""
         generator = torch.Generator(device=batch["poses"].device).manual_seed(index)
         losses, t = self.model.loss(batch, 1, generator)
-        self.log("validation/loss", losses.mean(), prog_bar=True, batch_size=len(losses), sync_dist=True)
+        self.log_mean("validation/loss", losses.mean(), len(losses), prog_bar=True)
         self._log_quarters("validation", losses, t)
 
     def _log_quarters(self, stage: str, losses: Tensor, t: Tensor) -> None:
         quarter = (t - 1) * 4 // self.model.schedule.steps
         for q in range(4):
-            if (quarter == q).any():
-                part = losses[quarter == q]
-                self.log(f"{stage}/loss_t{q + 1}of4", part.mean(), batch_size=len(part), sync_dist=stage != "train")
+            part, name = losses[quarter == q], f"{stage}/loss_t{q + 1}of4"
+            if stage == "train" and len(part):
+                self.log(name, part.mean())
+            elif stage != "train" and (len(part) or self.trainer.world_size > 1):
+                # Of several processes all say something, or one waits for ever.
+                self.log_mean(name, part.sum() / max(1, len(part)), len(part))
 
     def configure_optimizers(self) -> Any:
         """AdamW and its learning-rate course."""

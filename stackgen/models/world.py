@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from torch import Tensor
+
 from stackgen.data.shards import manifest_sha256
 from stackgen.geometry import PAPER_GRID, Grid
 from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, StackgenError
@@ -43,6 +45,11 @@ class WorldMixin:
                 "physics": manifest["physics"],
             }
         self.build()
+
+    def log_mean(self, name: str, mean: Tensor, count: int, prog_bar: bool = False) -> None:
+        """Log the mean over some samples; over batches and processes all samples count alike."""
+        # As a float, because Lightning rounds down what it averages of whole numbers (its issue 21859).
+        self.log(name, mean, prog_bar=prog_bar, batch_size=float(count), sync_dist=True)  # type: ignore[attr-defined]
 
     def card(self) -> dict[str, Any]:
         """What is known about the weights; see stackgen.weights."""

@@ -6,6 +6,7 @@ sliding fingers that a gear constraint keeps symmetric; they hold by friction, o
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 from collections.abc import Callable
@@ -312,10 +313,29 @@ def require_display() -> None:
     """See that a window can be opened: without a display Bullet ends the whole process.
 
     Raises:
-        StackgenError: If there is no display.
+        StackgenError: If there is no display, or none that answers.
     """
-    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-        raise StackgenError("--gui: there is no display to open a window on; leave it out, or use --video")
+    if sys.platform != "linux":
+        return
+    name = os.environ.get("DISPLAY")
+    if not name or not _answers(name):
+        what = f"the display {name} does not answer" if name else "there is no display to open a window on"
+        raise StackgenError(f"--gui: {what}; leave it out, or use --video")
+
+
+def _answers(display: str) -> bool:
+    """Whether an X server is there, by the library that Bullet's window uses."""
+    try:
+        x11 = ctypes.CDLL("libX11.so.6")
+    except OSError:
+        return False
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    x11.XOpenDisplay.argtypes = [ctypes.c_char_p]
+    x11.XCloseDisplay.argtypes = [ctypes.c_void_p]
+    connection = x11.XOpenDisplay(display.encode())
+    if connection:
+        x11.XCloseDisplay(connection)
+    return bool(connection)
 
 
 def _open_world(physics: Physics, window: bool) -> int:

@@ -56,9 +56,9 @@ class EarlyTerminate:
         """Reports before a trial can be given up."""
         if self.min_iter is not None:
             return self.min_iter
-        if self.max_iter is None:
+        if self.max_iter is None or self.s is None:  # W&B takes no less
             raise StackgenError("early_terminate: give min_iter, or max_iter and s")
-        return max(1, self.max_iter // self.eta ** (self.s or 1))
+        return max(1, self.max_iter // self.eta**self.s)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ import shutil
 import subprocess
 import sys
 from collections import Counter
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,10 +20,8 @@ from stackgen.data.arrays import StackArrays, save_npz
 from stackgen.data.cached import CachedLoader
 from stackgen.data.datamodule import StackDataModule
 from stackgen.data.decoding import Frame
-from stackgen.data.physics import physics_differences, warn_of_other_physics
 from stackgen.data.shards import Manifest
 from stackgen.stack import StackgenError
-from tests.conftest import Cli
 
 
 def _place(rank: int, world: int = 3) -> tuple[int, int]:
@@ -298,50 +295,6 @@ def test_memory_counted_is_memory_taken(splits: dict[str, StackArrays]) -> None:
     arrays = splits["train"]
     parts = (arrays.shapes, arrays.poses, arrays.silhouettes, arrays.template, arrays.counts, arrays.lengths)
     assert sum(part.nbytes for part in parts) == len(arrays) * Frame(10, 4, 64).bytes_per_sample
-
-
-# Whose physics.
-
-
-def test_other_physics_are_named_once(recwarn: pytest.WarningsRecorder) -> None:
-    here = {"engine": "pybullet 3.2.7", "friction": 0.5, "watch": 2.0}
-    made = {**here, "friction": 0.25, "engine": "pybullet 3.2.6"}
-    for _ in range(2):
-        warn_of_other_physics("dataset x", made, here)
-    lines = [str(warning.message) for warning in recwarn]
-    assert lines == [
-        "dataset x was made with other physics than are used here: "
-        "engine pybullet 3.2.6 instead of pybullet 3.2.7, friction 0.25 instead of 0.5"
-    ]
-    for same in (here, None, {"engine": "pybullet absent", "new": 1}):
-        warn_of_other_physics("dataset y", same, here)
-    assert len(recwarn) == 1
-    assert physics_differences({"engine": "other 1"}, here) == ["engine other 1 instead of pybullet 3.2.7"]
-
-
-TINY = """
-trainer: {max_steps: 1, logger: false, enable_checkpointing: false, enable_progress_bar: false,
-          enable_model_summary: false, limit_val_batches: 0}
-model:
-  class_path: stackgen.models.ddpm.DDPM
-  init_args: {denoiser: {width: 32, layers: 1, heads: 2, feedforward: 64}}
-"""
-
-
-@pytest.mark.filterwarnings("ignore::UserWarning:lightning.*", "ignore::FutureWarning")
-def test_fit_says_so_once_if_the_data_are_of_other_physics(
-    cli: Cli, towers_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(towers_dataset, "data")
-    manifest = Manifest.load("data")
-    replace(manifest, physics={**manifest.physics, "solver_iterations": 20}).save(Path("data"))
-    Path("tiny.yaml").write_text(TINY)
-    with pytest.warns(UserWarning, match="other physics") as caught:
-        answer = cli("fit", "--config", "tiny.yaml", "--data.path", "data")
-    assert answer.code == 0, answer.err
-    lines = [str(warning.message) for warning in caught if "physics" in str(warning.message)]
-    assert lines == ["dataset data was made with other physics than are used here: solver_iterations 20 instead of 60"]
 
 
 DISTRIBUTED = """

@@ -11,10 +11,8 @@ import torch
 from torch import Tensor
 
 from stackgen.data.arrays import StackArrays
-from stackgen.geometry import Mask
 from stackgen.models.denoiser import DenoiserConfig
 from stackgen.models.diffusion import DiffusionConfig, DiffusionSampler, PoseDiffusion
-from stackgen.models.network_sampler import pad_shapes
 from stackgen.models.sampler_config import SPACING, SamplerConfig
 from stackgen.models.schedules import ScheduleConfig
 from stackgen.stack import StackgenError, shapes_of
@@ -383,29 +381,3 @@ def test_the_network_is_shown_its_last_estimate(batch: dict[str, Tensor], monkey
     assert shown[0][0] is None and len(shown) == 10
     for (seen, _), (_, before) in zip(shown[1:], shown, strict=False):
         assert (seen == before).all() and before.abs().max() <= 1.5
-
-
-def pictures(count: int, size: int = 64) -> Mask:
-    return np.zeros((count, size, size), dtype=bool)
-
-
-@pytest.mark.parametrize(
-    ("silhouettes", "counts", "message"),
-    [
-        (pictures(1, 32), [[1, 0, 0, 0]], r"\(B, 64, 64\)"),
-        (pictures(2), [[1, 0, 0, 0]], "as many"),
-        (pictures(1)[0], [[1, 0, 0, 0]], r"\(B, 64, 64\)"),
-        (pictures(1), [[0, 0, 0, 0]], "1 to 10 blocks"),
-        (pictures(1), [[11, 0, 0, 0]], "1 to 10 blocks"),
-    ],
-)
-def test_what_cannot_be_sampled_is_refused(silhouettes: Mask, counts: list[list[int]], message: str) -> None:
-    with pytest.raises(StackgenError, match=message):
-        DiffusionSampler(model_for()).sample_batch(silhouettes, np.array(counts), 1, 0)
-
-
-def test_padded_shapes_are_the_block_lists() -> None:
-    counts = np.array([[2, 0, 1, 0], [0, 1, 0, 0]])
-    shapes, mask = pad_shapes(counts, 4)
-    assert shapes.tolist() == [[0, 0, 2, -1], [1, -1, -1, -1]]
-    assert (mask == (shapes >= 0)).all()

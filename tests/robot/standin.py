@@ -19,6 +19,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,8 +28,7 @@ A = (0.0, -0.425, -0.39225, 0.0, 0.0, 0.0)
 D = (0.089159, 0.0, 0.0, 0.10915, 0.09465, 0.0823)
 ALPHA = (math.pi / 2, 0.0, 0.0, math.pi / 2, -math.pi / 2, 0.0)
 
-STOPPED, PLAYING = 1, 2
-READY, DONE = 1, 2
+STOPPED, PLAYING = READY, DONE = 1, 2
 SAFETY = {"NORMAL": 1, "PROTECTIVE_STOP": 1 << 2}
 MOVEJ, MOVEL, SET_PAYLOAD, SET_TCP, SOLVE, STOPL, STOPJ, WATCHDOG, STOP_SCRIPT = 1, 3, 17, 29, 30, 33, 34, 35, 255
 
@@ -323,12 +323,10 @@ def exactly(link: socket.socket, count: int) -> bytes:
 
 def lines(link: socket.socket, answer: Callable[[str], bytes], greeting: bytes = b"") -> None:
     """A line for a line."""
-    try:
+    with suppress(OSError):
         link.sendall(greeting)
         for line in link.makefile("r"):
             link.sendall(answer(line.strip()))
-    except OSError:
-        pass
 
 
 def scripts(controller: Controller, link: socket.socket) -> None:

@@ -48,7 +48,8 @@ class GenerateSettings:
         stacks: Stop once this many are stored.
         seed: Same seed, same dataset.
         templates_per_shard: All stacks of so many templates share a shard and a split.
-        validation, test: Shares of the templates that go to these splits; 1 - both is for training.
+        validation: Share of the templates that goes to this split.
+        test: Likewise; what is left is for training.
         draw: Keep only so many of the stacks, drawn uniformly; 0 keeps all.
         max_removals: Blocks taken out of a template, at most.
         max_blocks: Stacks of more blocks are not stored, but still deconstructed.
