@@ -267,21 +267,21 @@ def _write(
 
 def _show(result: BuildReport) -> None:
     """A row for each block, and what stands in the end."""
-    table = Table(
-        "block", "released xy", "settled xy", "z", "yaw", "disturbed", "clearance", "time", box=None, pad_edge=False
-    )
-    for column in table.columns[1:]:
-        column.justify = "right"
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # 80 columns hold it
+    table.add_column("block", no_wrap=True)
+    headings = ("released\nxy mm", "settled\nxy mm", "z\nmm", "yaw\n°", "disturbed\nmm", "clearance\nmm", "time\ns")
+    for heading in headings:
+        table.add_column(heading, justify="right", no_wrap=True)
     for block in result.blocks:
         table.add_row(
             f"{block.block} ({block.shape})",
-            f"{block.released.xy:.2f} mm",
-            f"{block.settled.xy:.2f} mm",
-            f"{block.settled.z:+.2f} mm",
-            f"{block.settled.yaw:.2f}°",
-            f"{block.disturbed:.2f} mm",
-            f"{block.clearance:.1f} mm",
-            f"{block.seconds:.1f} s",
+            f"{block.released.xy:.2f}",
+            f"{block.settled.xy:.2f}",
+            f"{block.settled.z:+.2f}",
+            f"{block.settled.yaw:.2f}",
+            f"{block.disturbed:.2f}",
+            f"{block.clearance:.1f}",
+            f"{block.seconds:.1f}",
         )
     console = Console()
     console.print(table)
@@ -293,7 +293,7 @@ def _show(result: BuildReport) -> None:
     )  # fmt: skip
     console.print(
         f"{word}{match}; {result.order} order, least margin {result.least_margin:.1f}°;"
-        f" {result.seconds:.0f} s of the arm's time, {result.real_time_factor:.1f} times as fast",
+        f" {result.seconds:.0f} s of the arm's time, {result.real_time_factor:.1f} times real time",
         highlight=False,
     )
 

@@ -72,7 +72,7 @@ class SimulatedArm:
         frames: (4, 4) of each block at the beginning.
         physics: Of the blocks; its step is the simulation's.
         grasp: By friction, or by a fixed constraint.
-        window: Show it in a window, in real time.
+        window: Show it in a window, as fast as the display follows.
         on_step: Called after every step.
     """
 
@@ -89,7 +89,6 @@ class SimulatedArm:
         self.cell, self.stack, self.grasp, self.on_step = cell, stack, grasp, on_step
         self.physics = physics
         self.client = _open_world(physics, window)
-        self.window = window
         self.arm = load_arm(cell, self.client, visual=True)
         self.indices = ArmIndices.of(self.arm, self.client)
         self.fingers = {self.indices.links[name] for name in FINGERS}
@@ -102,6 +101,8 @@ class SimulatedArm:
             for shape, frame in zip(stack.shapes, frames, strict=True)
         ]
         self._prepare_arm()
+        if window:
+            bullet.configureDebugVisualizer(bullet.COV_ENABLE_RENDERING, 1, physicsClientId=self.client)
 
     @property
     def time(self) -> float:
@@ -348,7 +349,9 @@ def _open_world(physics: Physics, window: bool) -> int:
         return connect(physics)
     require_display()
     client = connect(physics, bullet.GUI)
-    bullet.configureDebugVisualizer(bullet.COV_ENABLE_GUI, 0, physicsClientId=client)
+    # Drawing waits until everything is loaded: with a software renderer every mesh would take a minute.
+    for switch in (bullet.COV_ENABLE_GUI, bullet.COV_ENABLE_SHADOWS, bullet.COV_ENABLE_RENDERING):
+        bullet.configureDebugVisualizer(switch, 0, physicsClientId=client)
     bullet.resetDebugVisualizerCamera(1.1, 20, -25, [0, 0.05, 0.15], physicsClientId=client)
     return client
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -80,6 +81,17 @@ def test_what_cannot_be_built_is_one_line_and_nothing_moves(
     assert answer.code == 2
     assert message in answer.line
     assert not out.exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have a display")
+def test_a_display_that_does_not_answer_is_one_line(
+    cli: Cli, stacks: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bullet would end the whole process."""
+    monkeypatch.setenv("DISPLAY", ":4711")
+    answer = cli("build", stacks, "--gui", "--out", tmp_path / "out")
+    assert answer.code == 2 and "--gui: the display :4711 does not answer" in answer.line
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_shipped_cell_is_the_default() -> None:

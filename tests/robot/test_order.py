@@ -96,13 +96,33 @@ def test_a_counterweight_needs_a_third_hand_and_the_step_is_named() -> None:
     order = plan_order(COUNTERWEIGHT)
     assert not order.safe and sorted(order.blocks) == [0, 1, 2, 3]
     assert order.blocked is not None and "needs a third hand" in order.blocked and "\n" not in order.blocked
-    assert "block 1 (rectangle)" in order.blocked
+    assert "block 3 (long_rectangle) is in the way of block 1 (rectangle), and without it block 1" in order.blocked
+    assert "beside its support" in order.blocked
     assert SimulatorChecker().check(COUNTERWEIGHT).stable  # it is the way there that fails
 
 
 def test_without_a_gripper_the_counterweight_can_be_slid_in() -> None:
     order = plan_order(COUNTERWEIGHT, approach=lambda stack, placed, block: True)
     assert order.safe and order.blocks[-1] == 1
+
+
+def test_what_would_fall_is_named_by_its_number_in_the_stack() -> None:
+    """The beam, block 4, is what would tip; the cubes that it carries only lose their support."""
+    tower = stack_of((RECTANGLE, 0.05, 0), (CUBE, -1.57, 2), (CUBE, -0.54, 2), (CUBE, -0.51, 3), (RECTANGLE, -0.9, 1))
+    order = plan_order(tower)
+    assert order.blocked is not None
+    assert "block 3 (cube) is in the way of block 1 (cube), and without it block 4 (rectangle) would" in order.blocked
+
+
+def test_a_gripper_that_gets_nowhere_is_said_to() -> None:
+    order = plan_order(ARCH, approach=lambda stack, placed, block: False)
+    assert order.blocked is not None and "the gripper does not get block" in order.blocked
+
+
+def test_a_tall_block_is_held_where_the_palm_clears_its_top() -> None:
+    """On end a long rectangle is taken near its top: what is a layer high beside it is not in the way."""
+    stack = Stack([LONG, CUBE], [[0, 0, 1.5, 0, np.pi / 2, 0], [1.1, 0, 1.5, 0, 0, 0]])
+    assert TopDownJaws()(stack, (1,), 0)
 
 
 def test_greedy_says_where_it_fails() -> None:
