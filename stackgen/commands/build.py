@@ -80,7 +80,7 @@ def main(
         real: Who builds, and what a real arm needs.
     """
     from stackgen.robot.film import check_suffix
-    from stackgen.robot.simulation import require_display
+    from stackgen.robot.window import require_display
 
     if noise_mm < 0 or noise_deg < 0 or seed < 0:
         raise StackgenError("--noise_mm, --noise_deg and --seed must be at least 0")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,6 +22,7 @@ from stackgen.robot.planning import BlockPlan, BuildPlan
 from stackgen.robot.report import BlockReport, BuildReport, PlacementError
 from stackgen.robot.simulation import PickNoise, SimulatedArm
 from stackgen.robot.staging import make_room
+from stackgen.robot.window import Window
 from stackgen.sim.physics import Physics
 from stackgen.sim.verdict import SimulatorChecker
 from stackgen.stack import Stack, StackgenError
@@ -186,10 +188,12 @@ def build(
     frames = {step.block: step.waiting.frame for step in plan.blocks}
     believed = [frames[block] for block in range(len(plan.stack))]
     begin = time.perf_counter()
-    with SimulatedArm(cell, plan.stack, noise.disturb(believed), physics, grasp, window) as arm:
+    with ExitStack() as opened:
+        arm = opened.enter_context(SimulatedArm(cell, plan.stack, noise.disturb(believed), physics, grasp))
+        view = opened.enter_context(Window(arm)).step if window else lambda: None
         slots = [PlacementError.between(arm.frame(block), believed[block]) for block in range(len(plan.stack))]
         film = camera(arm) if camera else lambda end: None
-        watch = _watched(plan, arm, on_block, film)
+        watch = _watched(plan, arm, on_block, film, view)
         seconds, wall = arm.time, time.perf_counter() - begin
         film(True)
         built = arm.built()
@@ -220,7 +224,11 @@ def build(
 
 
 def _watched(
-    plan: BuildPlan, arm: SimulatedArm, on_block: Callable[[int], None], film: Callable[[bool], None]
+    plan: BuildPlan,
+    arm: SimulatedArm,
+    on_block: Callable[[int], None],
+    film: Callable[[bool], None],
+    view: Callable[[], None],
 ) -> _Watch:
     """Carry out a plan and wait until all is at rest; what was seen."""
     watch = _Watch(arm)
@@ -228,6 +236,7 @@ def _watched(
     def on_step() -> None:
         watch.step()
         film(False)
+        view()
 
     def on_done(step: BlockPlan) -> None:
         watch.done(step)

@@ -32,8 +32,9 @@ Strategy = Literal["safest", "greedy"]
 Approach = Callable[[Stack, tuple[int, ...], int], bool]
 """(stack, blocks placed before, block) -> whether the gripper gets the block to its place and away again."""
 
-BESIDE = 0.05
-"""Blocks that overlap sideways by less than this stand side by side [cell]."""
+BESIDE = 0.005
+"""Blocks that overlap sideways by less than this stand side by side, but for rounding [cell]: whoever lies over
+another's end by half a millimetre is in its way from above."""
 
 BELOW = 0.3
 """A block may reach this far up into the one that is lowered onto it: they touch [cell]."""

@@ -6,9 +6,6 @@ sliding fingers that a gear constraint keeps symmetric; they hold by friction, o
 
 from __future__ import annotations
 
-import ctypes
-import os
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
@@ -26,7 +23,7 @@ from stackgen.robot.motion import Motion
 from stackgen.robot.urdf import BASE, FINGERS, PALM, ur5_chain
 from stackgen.sim.physics import Physics
 from stackgen.sim.world import Mold, bullet, connect
-from stackgen.stack import Shape, Stack, StackgenError
+from stackgen.stack import Shape, Stack
 
 Floats = NDArray[np.float64]
 
@@ -72,7 +69,6 @@ class SimulatedArm:
         frames: (4, 4) of each block at the beginning.
         physics: Of the blocks; its step is the simulation's.
         grasp: By friction, or by a fixed constraint.
-        window: Show it in a window, as fast as the display follows.
         on_step: Called after every step.
     """
 
@@ -83,12 +79,11 @@ class SimulatedArm:
         frames: list[Floats],
         physics: Physics,
         grasp: Grasp = "jaws",
-        window: bool = False,
         on_step: Callable[[], None] = lambda: None,
     ) -> None:
         self.cell, self.stack, self.grasp, self.on_step = cell, stack, grasp, on_step
         self.physics = physics
-        self.client = _open_world(physics, window)
+        self.client = connect(physics)
         self.arm = load_arm(cell, self.client, visual=True)
         self.indices = ArmIndices.of(self.arm, self.client)
         self.fingers = {self.indices.links[name] for name in FINGERS}
@@ -101,8 +96,6 @@ class SimulatedArm:
             for shape, frame in zip(stack.shapes, frames, strict=True)
         ]
         self._prepare_arm()
-        if window:
-            bullet.configureDebugVisualizer(bullet.COV_ENABLE_RENDERING, 1, physicsClientId=self.client)
 
     @property
     def time(self) -> float:
@@ -200,16 +193,7 @@ class SimulatedArm:
     def _spawn(self, shape: Shape, index: int, frame: Floats) -> int:
         """A block with the physics of the verdicts and a colour for the camera."""
         mold = Mold.cast(shape, self.physics, self.client)
-        corners, normals, faces = _mesh(shape, self.physics.cell_size)
-        colour = [*(channel / 255 for channel in shape_colour(index)), 1.0]
-        visual = bullet.createVisualShape(
-            bullet.GEOM_MESH,
-            vertices=corners,
-            normals=normals,
-            indices=faces,
-            rgbaColor=colour,
-            physicsClientId=self.client,
-        )
+        visual = block_visual(shape, index, self.physics.cell_size, self.client)
         position, quaternion = body_placement(shape, frame, self.physics.cell_size)
         body = bullet.createMultiBody(
             mold.mass, mold.collision, visual, position, quaternion, physicsClientId=self.client
@@ -310,50 +294,20 @@ class SimulatedArm:
         self.on_step()
 
 
-def require_display() -> None:
-    """See that a window can be opened: without a display Bullet ends the whole process.
-
-    Raises:
-        StackgenError: If there is no display, or none that answers.
-    """
-    if sys.platform != "linux":
-        return
-    name = os.environ.get("DISPLAY")
-    if not name or not _answers(name):
-        what = f"the display {name} does not answer" if name else "there is no display to open a window on"
-        raise StackgenError(f"--gui: {what}; leave it out, or use --video")
-
-
-def _answers(display: str) -> bool:
-    """Whether an X server is there, by the library that Bullet's window uses."""
-    try:
-        x11 = ctypes.CDLL("libX11.so.6")
-    except OSError:
-        return False
-    x11.XOpenDisplay.restype = ctypes.c_void_p
-    x11.XOpenDisplay.argtypes = [ctypes.c_char_p]
-    x11.XCloseDisplay.argtypes = [ctypes.c_void_p]
-    connection = x11.XOpenDisplay(display.encode())
-    if connection:
-        x11.XCloseDisplay(connection)
-    return bool(connection)
-
-
-def _open_world(physics: Physics, window: bool) -> int:
-    """The world of the verdicts, in a window if asked for.
-
-    Raises:
-        StackgenError: If there is no display to open one on.
-    """
-    if not window:
-        return connect(physics)
-    require_display()
-    client = connect(physics, bullet.GUI)
-    # Drawing waits until everything is loaded: with a software renderer every mesh would take a minute.
-    for switch in (bullet.COV_ENABLE_GUI, bullet.COV_ENABLE_SHADOWS, bullet.COV_ENABLE_RENDERING):
-        bullet.configureDebugVisualizer(switch, 0, physicsClientId=client)
-    bullet.resetDebugVisualizerCamera(1.1, 20, -25, [0, 0.05, 0.15], physicsClientId=client)
-    return client
+def block_visual(shape: Shape, index: int, cell_size: float, client: int) -> int:
+    """How a block looks: its mesh, in the colour of its number in the catalogue."""
+    corners, normals, faces = _mesh(shape, cell_size)
+    colour = [*(channel / 255 for channel in shape_colour(index)), 1.0]
+    return int(
+        bullet.createVisualShape(
+            bullet.GEOM_MESH,
+            vertices=corners,
+            normals=normals,
+            indices=faces,
+            rgbaColor=colour,
+            physicsClientId=client,
+        )
+    )
 
 
 def _mesh(shape: Shape, cell_size: float) -> tuple[list[list[float]], list[list[float]], list[int]]:
