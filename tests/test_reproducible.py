@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 
+from stackgen.models.ddpm import DDPM
 from tests.conftest import Cli
 
 CONFIG = """
@@ -89,6 +90,31 @@ def test_a_training_is_repeated_and_resumed_to_the_last_bit(cli: Cli, config: Pa
     assert resumed.items() <= first.items()
     for key in ("state_dict", "raw_state_dict", "optimizer_states", "lr_schedulers", "StackDataModule"):
         assert same(state(2)[key], state(0)[key]) and same(state(1)[key], state(0)[key]), key
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("step", [3, 6])  # the first of an epoch, and one in its middle
+def test_what_ctrl_c_stopped_in_the_middle_of_a_step_goes_on_as_if_it_had_not(
+    step: int, cli: Cli, config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit = ["fit", "--config", config, "--dashboard", "none"]
+    config.write_text(config.read_text().replace("save_last: true", "save_last: true, save_on_exception: true"))
+    assert cli(*fit).code == 0
+    training_step = DDPM.training_step
+
+    def interrupted(self: DDPM, batch: dict[str, torch.Tensor], index: int) -> torch.Tensor:
+        if self.trainer.global_step == step:
+            raise KeyboardInterrupt
+        return training_step(self, batch, index)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(DDPM, "training_step", interrupted)
+        assert cli(*fit).code == 130
+    assert state(1)["global_step"] == step
+    answer = cli(*fit, "--ckpt_path", "runs/twice/version_1/checkpoints/last.ckpt")
+    assert answer.code == 0, answer.err
+    for key in ("global_step", "state_dict", "raw_state_dict", "optimizer_states", "StackDataModule"):
+        assert same(state(2)[key], state(0)[key]), key
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -173,16 +173,16 @@ def test_an_interrupted_sweep_goes_on_with_the_same_trials(program: Path, tmp_pa
 
     def interrupt(line: str) -> None:
         lines.append(line)
-        if len(lines) == 2:
+        if len(lines) == 1:  # the other trial may have ended too, but nobody has heard of it
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         run_sweep(sweep, folder, 2, tell=interrupt)
     before = {trial.number: trial.params for trial in open_study(sweep, folder).trials}
-    assert states(folder, sweep).count("complete") == 2 and states(folder, sweep).count("running") >= 1
+    assert states(folder, sweep).count("complete") == 1 and states(folder, sweep).count("running") >= 1
     study = run_sweep(sweep, folder, 2, tell=lines.append)
     assert states(folder, sweep) == ["complete"] * 5
-    assert "were interrupted and begin again" in lines[2]
+    assert "were interrupted and begin again" in lines[1]
     assert {n: study.trials[n].params for n in before} == before
     assert sum(starts(folder)) <= 5 + 2
 

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 def main(
     file: Path | None = None,
-    index: int = 0,
+    stack: int = 1,
     from_image: Path | None = None,
     inventory: str | None = None,
     weights: str = DEFAULT,
@@ -58,7 +58,7 @@ def main(
 
     Args:
         file: A stacks.json.
-        index: Which of its stacks, from 0.
+        stack: Which of its stacks, counted from 1.
         from_image: Build what is in a picture, or the photo of a sketch, instead: block list, verified stacks,
             the best of them.
         inventory: With --from_image, the blocks there are, such as cube=4,rectangle=3.
@@ -92,7 +92,7 @@ def main(
     if gui:
         require_display()
     content, entries = (
-        _from_file(file, index, inventory, budget)
+        _from_file(file, stack, inventory, budget)
         if from_image is None
         else _from_image(from_image, file, inventory, weights, budget, seed)
     )
@@ -115,16 +115,16 @@ def main(
 
 
 def _from_file(
-    file: Path | None, index: int, inventory: str | None, budget: str | None
+    file: Path | None, number: int, inventory: str | None, budget: str | None
 ) -> tuple[StacksFile, list[Entry]]:
     if file is None:
         raise StackgenError("give a stacks.json, or a picture with --from_image")
     if inventory is not None or budget is not None:
         raise StackgenError("--inventory and --budget go with --from_image: a stacks.json names its blocks")
     content = read_stacks(file)
-    if not 0 <= index < len(content.entries):
-        raise StackgenError(f"--index {index}: {file} has {len(content.entries)} stacks, numbered from 0")
-    return content, [content.entries[index]]
+    if not 1 <= number <= len(content.entries):
+        raise StackgenError(f"{file}: --stack must lie in 1..{len(content.entries)}, got {number}")
+    return content, [content.entries[number - 1]]
 
 
 def _from_image(
@@ -311,7 +311,7 @@ COMMAND = Command(
     main,
     """
     stackgen build examples/stacks/arch.json --video arch.mp4
-    stackgen build out/arch/stacks.json --index 1 --noise_mm 1 --noise_deg 1 --out out/built
+    stackgen build out/arch/stacks.json --stack 2 --noise_mm 1 --noise_deg 1 --out out/built
     stackgen build --from_image examples/silhouettes/house.png --inventory cube=6,triangle=2 --video house.gif
     stackgen build out/arch/stacks.json --config configs/robot/ur5.yaml --cell.base.position "[0, 0.42, 0]"
     stackgen build examples/stacks/arch.json --staging_sheet sheet.pdf --arm urscript

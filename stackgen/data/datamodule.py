@@ -175,6 +175,7 @@ class StackDataModule(pl.LightningDataModule):
             from stackgen.data.streaming import TrainingStream
 
             self._training = TrainingStream(self.path, self.batch_size, num_workers=self.num_workers, **options)
+        self._training.in_hand = self._in_hand
         if self._resume is not None:
             self._training.load_state_dict(self._resume)
             self._resume = None
@@ -198,6 +199,13 @@ class StackDataModule(pl.LightningDataModule):
     def state_dict(self) -> dict[str, Any]:
         """Where training is, for checkpoints."""
         return {} if self._training is None else {"training": self._training.state_dict()}
+
+    def _in_hand(self) -> bool:
+        """Whether training stopped in the middle of a step, as by Ctrl-C."""
+        if self.trainer is None:
+            return False
+        batches = self.trainer.fit_loop.epoch_loop.batch_progress.current
+        return batches.ready > batches.processed  # type: ignore[attr-defined]
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Let training go on from there; before Lightning asks how long an epoch is."""

@@ -40,6 +40,8 @@ class Epochs(ABC):
         self._epoch, self._workers = epoch, workers
         self._passed = 0  # epochs begun
         self._state: dict[str, Any] = {"epoch": -1, "batches": 0}  # where the last iteration is
+        self._before = self._state  # one batch earlier
+        self.in_hand: Callable[[], bool] = lambda: False  # whether the last batch was taken but not learnt from
         self._resume: tuple[int, int, Cursor] | None = None  # epoch, batches done in it, place
         self._relaid_length: int | None = None
 
@@ -73,16 +75,17 @@ class Epochs(ABC):
             _, done, cursor = resume
         else:
             done, cursor, self._relaid_length = 0, self._beginning(epoch), None
+        self._state = {"epoch": epoch, "batches": done, **cursor.to_json()}
         while cursor.left > 0:
             for batch in self._deal(cursor):
                 cursor, done = cursor.moved(), done + 1
-                self._state = {"epoch": epoch, "batches": done, **cursor.to_json()}
+                self._before, self._state = self._state, {"epoch": epoch, "batches": done, **cursor.to_json()}
                 yield batch
             cursor = cursor.next_pass()
 
     def state_dict(self) -> dict[str, Any]:
-        """Where the epoch is; Lightning keeps it in its checkpoints."""
-        return dict(self._state)
+        """Where the epoch is; Lightning keeps it in its checkpoints. A batch that is in hand is still to come."""
+        return dict(self._before if self.in_hand() else self._state)
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Let the next iteration, if of the same epoch, go on from there."""

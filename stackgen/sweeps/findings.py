@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 BEST, LEADERBOARD, IMPORTANCE, SLICES = "best.yaml", "leaderboard.csv", "importance.png", "slices.png"
 _COLOURS = {"complete": "#3b78b4", "pruned": "#b9bec7", "best": "#c8402f"}
 _DPI = 130
+_LETTERS = 24  # of a setting that is a text
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ def leaderboard_table(rows: Sequence[Row], sweep: Sweep, most: int = 10) -> Tabl
 
 
 def _shown(value: Any) -> str:
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{value:.3g}" if isinstance(value, float) else str(value)[:_LETTERS]
 
 
 def best_configuration(best: Row, sweep: Sweep, folder: Path, trials: int) -> str:
@@ -188,9 +189,19 @@ def slice_figure(rows: Sequence[Row], sweep: Sweep) -> Figure:
         choices = getattr(distribution, "choices", None)
         _draw_slice(axes, rows, name, choices)
         if getattr(distribution, "log", False):
-            axes.set_xscale("log")
+            _logarithmic(axes)
         axes.set(xlabel=name, ylabel=sweep.metric.name if place % columns == 0 else "")
     return figure
+
+
+def _logarithmic(axes: Axes) -> None:
+    """A logarithmic x axis with numbers at 1, 2 and 5 times powers of ten."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
+
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
+    axes.xaxis.set_minor_locator(NullLocator())
 
 
 def _draw_slice(axes: Axes, rows: Sequence[Row], name: str, choices: Sequence[Any] | None) -> None:
@@ -200,7 +211,7 @@ def _draw_slice(axes: Axes, rows: Sequence[Row], name: str, choices: Sequence[An
         at = [choices.index(row.values[name]) if choices else row.values[name] for row in shown]
         axes.scatter(at, [row.value for row in shown], s=26, color=_COLOURS[kind], zorder=3 if kind == "best" else 2)
     if choices:
-        axes.set_xticks(range(len(choices)), [str(choice)[:24] for choice in choices])
+        axes.set_xticks(range(len(choices)), [str(choice)[:_LETTERS] for choice in choices])
         axes.set_xlim(-0.5, len(choices) - 0.5)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", alpha=0.3)

@@ -53,8 +53,8 @@ def nothing_moves(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["{stacks}", "--index", 1], "block 0 (cube) would fall"),
-        (["{stacks}", "--index", 2], "has 2 stacks, numbered from 0"),
+        (["{stacks}", "--stack", 2], "block 0 (cube) would fall"),
+        (["{stacks}", "--stack", 3], "--stack must lie in 1..2, got 3"),
         (["no.json"], "no.json: no such file"),
         ([], "give a stacks.json, or a picture with --from_image"),
         (["{stacks}", "--from_image", "a.png"], "not both"),

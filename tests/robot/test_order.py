@@ -121,7 +121,7 @@ def test_a_gripper_that_gets_nowhere_is_said_to() -> None:
 
 def test_a_tall_block_is_held_where_the_palm_clears_its_top() -> None:
     """On end a long rectangle is taken near its top: what is a layer high beside it is not in the way."""
-    stack = Stack([LONG, CUBE], [[0, 0, 1.5, 0, np.pi / 2, 0], [1.1, 0, 1.5, 0, 0, 0]])
+    stack = Stack(np.array([LONG, CUBE]), np.array([[0, 0, 1.5, 0, np.pi / 2, 0], [1.1, 0, 1.5, 0, 0, 0]]))
     assert TopDownJaws()(stack, (1,), 0)
 
 
