@@ -23,6 +23,7 @@ SPEED = 8.0  # simulated seconds in a second of film
 SUFFIXES = (".mp4", ".gif")
 
 _FILM = (480, 360)
+_WALL, _TABLE = (245, 245, 243), (222, 215, 203)
 _LAST = 1.5  # the finished stack is shown for so long at the end of a film [s]
 
 
@@ -44,12 +45,12 @@ def picture(client: int, size: tuple[int, int] = (640, 480), near: bool = False)
     Args:
         client: Of the world.
         size: (width, height) [pixel].
-        near: Whether of the structure alone, or with the arm.
+        near: Whether of the structure below the jaws, or of all of the arm.
     """
-    target, distance, pitch = ([0, 0, 0.1], 0.62, -14) if near else ([0, 0.08, 0.2], 1.3, -20)
+    target, distance, pitch = ([0, 0, 0.19], 0.85, -14) if near else ([0, 0.08, 0.2], 1.3, -20)
     view = bullet.computeViewMatrixFromYawPitchRoll(target, distance, 18, pitch, 0, 2)
     lens = bullet.computeProjectionMatrixFOV(42, size[0] / size[1], 0.05, 5)
-    width, height, colours, *_ = bullet.getCameraImage(
+    width, height, colours, _, bodies = bullet.getCameraImage(
         *size,
         view,
         lens,
@@ -58,7 +59,24 @@ def picture(client: int, size: tuple[int, int] = (640, 480), near: bool = False)
         renderer=bullet.ER_TINY_RENDERER,
         physicsClientId=client,
     )
-    return np.asarray(colours, dtype=np.uint8).reshape(height, width, 4)[..., :3]
+    shown = np.array(colours, dtype=np.uint8).reshape(height, width, 4)[..., :3]
+    return outlined(shown, np.asarray(bodies).reshape(height, width))
+
+
+def outlined(colours: Picture, bodies: NDArray[np.int_]) -> Picture:
+    """(H, W, 3) with a plain table and wall, and a line around every body: blocks of one colour touch.
+
+    Args:
+        colours: (H, W, 3) as Bullet draws it.
+        bodies: (H, W) the body of each pixel, negative for none, 0 for the table.
+    """
+    shown = colours.copy()
+    shown[bodies < 0], shown[bodies == 0] = _WALL, _TABLE
+    border = np.zeros(bodies.shape, dtype=bool)
+    border[:, 1:] |= bodies[:, 1:] != bodies[:, :-1]
+    border[1:] |= bodies[1:] != bodies[:-1]
+    shown[border & (bodies > -1)] //= 3
+    return shown
 
 
 class Film:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stackgen.robot.film import SUFFIXES, _Writer, check_suffix, picture
+from stackgen.robot.film import SUFFIXES, _Writer, check_suffix, outlined, picture
 from stackgen.sim.physics import Physics
 from stackgen.sim.world import Mold, bullet, connect
 from stackgen.stack import PAPER_CATALOGUE, StackgenError
@@ -62,3 +62,10 @@ def test_the_camera_sees_a_block_in_front_of_the_table() -> None:
         bullet.disconnect(client)
     changed = (empty != full).any(axis=2)
     assert empty.shape == (60, 80, 3) and changed[20:40, 30:50].any() and not changed[:, :10].any()
+
+
+def test_blocks_of_one_colour_are_told_apart() -> None:
+    bodies = np.array([[-1, -1, -1, -1], [0, 1, 1, 2], [0, 1, 1, 2], [0, 0, 0, 0]])
+    shown = outlined(np.full((4, 4, 3), 200, dtype=np.uint8), bodies)
+    assert (shown[2, 2] == 200).all() and (shown[2, [1, 3]] < 100).all()
+    assert (shown[0] == shown[0, 0]).all() and (shown[2, 0] != shown[0, 0]).any()
