@@ -59,8 +59,8 @@ def main(
     Args:
         file: A stacks.json.
         stack: Which of its stacks, counted from 1.
-        from_image: Build what is in a picture, or the photo of a sketch, instead: block list, verified stacks,
-            the best of them.
+        from_image: Build what is in a picture, the photo of a sketch, or a depth frame (as for `stackgen capture`),
+            instead: block list, verified stacks, the best of them.
         inventory: With --from_image, the blocks there are, such as cube=4,rectangle=3.
         weights: With --from_image, the sampler's: a name, a .safetensors, a .ckpt or the folder of a run.
         budget: With --from_image, what finding a stack may cost: a time such as 5s or a number of draws.
@@ -164,14 +164,17 @@ _SAME = 0.7
 
 
 def _seen(image: Path, grid: Grid) -> Mask:
-    """The silhouette in a drawing, or in the photo of one.
+    """The silhouette in a drawing, in the photo of one, or in a depth frame.
 
     A clean picture is read by its colours; that fails, or sees something else, where light is uneven or only the
     outline is drawn: then it is a sketch.
     """
     from stackgen.images import read_silhouette
+    from stackgen.robot.capture import capture, is_depth, read_frame
     from stackgen.robot.sketch import read_sketch
 
+    if is_depth(image):
+        return capture(read_frame(image), grid).silhouette
     try:
         sketch = read_sketch(image, grid).silhouette
     except StackgenError:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 Picture = NDArray[np.uint8]
 
 _FOUND = (214, 39, 40)
+_LEFT_OUT = 0.05  # worth telling
 
 
 @dataclass(frozen=True)
@@ -33,13 +34,11 @@ class _Result:
         silhouette: (H, W).
         overlay: What was seen, with what was found in it.
         lines: To print.
-        counts: (S,) block list, where the drawing gives one.
     """
 
     silhouette: Mask
     overlay: Picture
     lines: tuple[str, ...]
-    counts: NDArray[np.int64] | None = None
 
 
 def main(
@@ -86,15 +85,15 @@ def main(
     elif simulate:
         frame, expected_of_stack = _simulated(simulate, stack, elevation, azimuth, seed)
         expected = expected_of_stack if expected is None else expected
-        result = _from_frame(frame)
+        result = _from_frame(frame, freehand)
     elif depth:
         from stackgen.robot.capture import read_frame
 
-        result = _from_frame(read_frame(depth, color, focal), str(depth))
+        result = _from_frame(read_frame(depth, color, focal), freehand, str(depth))
     else:
         from stackgen.robot.capture_camera import realsense_frame
 
-        result = _from_frame(realsense_frame())
+        result = _from_frame(realsense_frame(), freehand)
     _write(result, out, overlay or out.with_name(f"{out.stem}-overlay.png"))
     if network:
         from stackgen.api import load
@@ -111,16 +110,12 @@ def _from_sketch(path: Path, freehand: bool) -> _Result:
     from stackgen.robot.sketch import read_sketch
 
     found = read_sketch(path)
-    whole = found.counts is not None or not np.array_equal(found.silhouette, found.drawn)
     shown = found.drawn if freehand else found.silhouette
-    cells = "\n".join("  " + "".join(".#^"[cell] for cell in row) for row in found.cells[::-1])
-    lines = [f"cells:\n{cells}" if whole else "not made of whole cells: the silhouette is as drawn"]
-    if found.counts is not None:
-        lines.append(f"block list by the heuristic: {format_block_list(found.counts)}")
-    return _Result(shown, _sketch_overlay(found.photo, found.sheet, shown), tuple(lines), found.counts)
+    lines = _made_of(found.cells, found.counts, np.array_equal(found.silhouette, found.drawn))
+    return _Result(shown, _sketch_overlay(found.photo, found.sheet, shown), lines)
 
 
-def _from_frame(frame: Frame, name: str = "") -> _Result:
+def _from_frame(frame: Frame, freehand: bool, name: str = "") -> _Result:
     """The structure in a frame."""
     from stackgen.robot.capture import capture
 
@@ -129,8 +124,23 @@ def _from_frame(frame: Frame, name: str = "") -> _Result:
     except StackgenError as error:
         raise StackgenError(f"{name}: {error}" if name else str(error)) from error
     width, height = found.size
-    line = f"structure: {1e3 * width:.0f} mm wide, {1e3 * height:.0f} mm high"
-    return _Result(found.silhouette, _frame_overlay(frame, found.seen, found.outline, found.silhouette), (line,))
+    shown = found.as_seen if freehand else found.silhouette
+    lines = [f"structure: {1e3 * width:.0f} mm wide, {1e3 * height:.0f} mm high"]
+    if found.left_out > _LEFT_OUT:
+        lines.append(f"left out: what stands beside it and touches it nowhere, {found.left_out:.0%} of its size")
+    lines += _made_of(found.cells, found.counts, np.array_equal(found.silhouette, found.as_seen))
+    return _Result(shown, _frame_overlay(frame, found.seen, found.outline, shown), tuple(lines))
+
+
+def _made_of(cells: NDArray[np.int64], counts: NDArray[np.int64] | None, unchanged: bool) -> tuple[str, ...]:
+    """Lines about the cells that were found."""
+    if unchanged and counts is None:
+        return ("not made of whole cells: the silhouette is as seen",)
+    drawn = "\n".join("  " + "".join(".#^"[cell] for cell in row) for row in cells[::-1])
+    lines = [f"cells:\n{drawn}"]
+    if counts is not None:
+        lines.append(f"block list by the heuristic: {format_block_list(counts)}")
+    return tuple(lines)
 
 
 def _simulated(path: Path, number: int, elevation: float, azimuth: float, seed: int) -> tuple[Frame, Mask]:
@@ -202,7 +212,7 @@ COMMAND = Command(
     """,
     flags={
         "realsense": "Take a frame of the first RealSense camera.",
-        "freehand": "Of a sketch write what was drawn, not the cells that it is made of.",
+        "freehand": "Write what was drawn or seen, not the cells that it is made of.",
         "network": "Also ask the network for a block list.",
     },
 )

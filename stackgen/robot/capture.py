@@ -3,7 +3,8 @@
 The background goes by depth: wall and table are planes, found along the picture's edges, and what stands clearly
 before the one and on the other is the structure. Its front is a plane, too; drawn as seen straight on from far away, a
 camera that is near, looks down or stands to one side does no harm. Then, as in the paper: a median filter, the largest
-component, resized and pasted onto the grid.
+component, resized and pasted onto the grid. What is nearly made of whole cells is taken to be: samplers know their
+edges.
 
 Camera frame: x to the right, y down, z away from the camera. Lengths in metres; H x W pixels.
 """
@@ -20,6 +21,7 @@ from numpy.typing import NDArray
 
 from stackgen.geometry import PAPER_GRID, Grid, Mask
 from stackgen.images import read_silhouette
+from stackgen.robot.cells import Ints, block_list, in_cells
 from stackgen.stack import StackgenError
 
 Floats = NDArray[np.float64]
@@ -48,6 +50,9 @@ MEDIAN = 5
 
 JOINT = 0.010
 """Parts of the structure nearer than this belong together [m]: between blocks side by side depth often fails."""
+
+ALIKE = 0.85
+"""IoU with the silhouette as seen from which on the structure is taken to be made of whole cells."""
 
 _EDGE = 0.12
 """Width of the strip along the picture's edge in which wall and table are looked for [share]."""
@@ -111,18 +116,26 @@ class Capture:
     """What was found in a frame.
 
     Args:
-        silhouette: (H, W) on the grid.
+        silhouette: (H, W) on the grid: that of the cells where the structure is made of whole cells, else as seen.
+        as_seen: (H, W) on the grid.
+        cells: (rows, columns) empty, full or triangle, the first row on the ground.
+        counts: (S,) block list by the heuristic; None where it is not made of whole cells, or of too many.
         seen: (H, W) of the frame: pixels of the structure.
         front: (h, w) the structure's front as seen straight on, `PIXEL` a pixel.
         outline: (4, 2) corners of that picture in the frame [pixel], from the upper left clockwise.
         size: Width and height of the structure [m].
+        left_out: What stands beside it and touches it nowhere, as a share of it.
     """
 
     silhouette: Mask
+    as_seen: Mask
+    cells: Ints
+    counts: Ints | None
     seen: Mask
     front: Mask
     outline: Floats
     size: tuple[float, float]
+    left_out: float
 
 
 def capture(frame: Frame, grid: Grid = PAPER_GRID) -> Capture:
@@ -146,7 +159,11 @@ def capture(frame: Frame, grid: Grid = PAPER_GRID) -> Capture:
     front = largest(_median(picture, MEDIAN), round(JOINT / PIXEL))
     rows, columns = np.flatnonzero(front.any(axis=1)), np.flatnonzero(front.any(axis=0))
     size = (float(np.ptp(columns) + 1) * PIXEL, float(np.ptp(rows) + 1) * PIXEL)
-    return Capture(read_silhouette(front, grid, exact=False), seen, front, outline, size)
+    as_seen = read_silhouette(front, grid, exact=False)
+    cells, whole = in_cells(as_seen, ALIKE, grid)
+    counts = None if whole is None else block_list(cells)
+    left_out = np.count_nonzero(foreground & ~seen) / np.count_nonzero(seen)
+    return Capture(as_seen if whole is None else whole, as_seen, cells, counts, seen, front, outline, size, left_out)
 
 
 def read_frame(depth: str | Path, colour: str | Path | None = None, focal: float | None = None) -> Frame:
@@ -166,6 +183,17 @@ def read_frame(depth: str | Path, colour: str | Path | None = None, focal: float
         raise (
             error if str(error).startswith((str(depth), str(colour))) else StackgenError(f"{depth}: {error}")
         ) from error
+
+
+def is_depth(path: str | Path) -> bool:
+    """Whether a file is a depth frame rather than a picture: a .npy, or an image of one channel of 16 bits."""
+    import cv2
+
+    path = Path(path)
+    if path.suffix == ".npy" or not path.is_file():
+        return path.suffix == ".npy"
+    values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    return values is not None and values.ndim == 2 and values.dtype == np.uint16
 
 
 def _read_depth(path: Path) -> Floats:

@@ -16,16 +16,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.geometry import PAPER_GRID, Grid, Mask, iou
-from stackgen.images import grid_offset, read_silhouette
+from stackgen.geometry import PAPER_GRID, Grid, Mask
+from stackgen.images import read_silhouette
 from stackgen.robot.capture import Picture, read_picture
-from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, StackgenError
+from stackgen.robot.cells import Ints, block_list, in_cells
+from stackgen.stack import StackgenError
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-
-EMPTY, FULL, TRIANGLE = range(3)
-"""What a cell may be."""
 
 WORK_SIZE = 1000
 """Longer edge [pixel] that photos are brought to."""
@@ -94,13 +91,9 @@ def _sketch(photo: Picture, grid: Grid) -> Sketch:
     sheet = find_sheet(photo)
     ink = one_drawing(filled_in(binarised(straightened(photo, sheet))))
     drawn = read_silhouette(ink, grid, exact=False)
-    aligned = np.roll(drawn, grid_offset(drawn, grid), axis=1)
-    cells = occupancy(aligned, grid)
-    whole = picture_of(cells, grid)
-    alike = iou(whole, aligned) >= ALIKE
-    counts = block_list(cells) if alike else None
-    silhouette = read_silhouette(whole, grid, exact=False) if alike else drawn
-    return Sketch(silhouette, drawn, cells, counts, sheet, photo, ink)
+    cells, whole = in_cells(drawn, ALIKE, grid)
+    counts = None if whole is None else block_list(cells)
+    return Sketch(drawn if whole is None else whole, drawn, cells, counts, sheet, photo, ink)
 
 
 def _scaled(picture: Picture) -> Picture:
@@ -318,66 +311,3 @@ def _without_specks(mask: Mask, share: float) -> Mask:
     areas = np.bincount(labels.ravel())
     areas[0] = 0
     return np.asarray((areas >= max(share * areas.max(), 1))[labels])
-
-
-def occupancy(silhouette: Mask, grid: Grid = PAPER_GRID) -> Ints:
-    """(height, width) what each cell of the grid is: of full, empty and triangle what it differs from least.
-
-    A triangle has nothing on top of it.
-
-    >>> picture = np.zeros((64, 64), dtype=bool)
-    >>> picture[46:60, 4:32] = True
-    >>> occupancy(picture)[0].tolist()
-    [1, 1, 0, 0]
-    """
-    patterns = {
-        kind: picture_of(np.full((1, 1), kind), Grid(1, 1, grid.image_size, grid.pixels_per_cell, grid.ground_margin))
-        for kind in (EMPTY, FULL, TRIANGLE)
-    }
-    cells = np.zeros((grid.height, grid.width), dtype=np.int64)
-    for row in reversed(range(grid.height)):
-        for column in range(grid.width):
-            window = _window(grid, row, column)
-            middle = _window(Grid(1, 1, grid.image_size, grid.pixels_per_cell, grid.ground_margin), 0, 0)
-            wrong = {kind: np.count_nonzero(silhouette[window] != p[middle]) for kind, p in patterns.items()}
-            if row + 1 < grid.height and cells[row + 1, column] != EMPTY:
-                del wrong[TRIANGLE]
-            cells[row, column] = min(wrong, key=lambda kind: wrong[kind])
-    return cells
-
-
-def _window(grid: Grid, row: int, column: int) -> tuple[slice, slice]:
-    """The pixels of a cell."""
-    scale = grid.pixels_per_cell
-    left = grid.image_size / 2 + (column - grid.width / 2) * scale
-    bottom = grid.image_size - grid.ground_margin - row * scale
-    return slice(round(bottom - scale), round(bottom)), slice(round(left), round(left + scale))
-
-
-def picture_of(cells: Ints, grid: Grid = PAPER_GRID) -> Mask:
-    """(H, W) silhouette of cells (rows, columns)."""
-    picture = np.zeros((grid.image_size,) * 2, dtype=bool)
-    x, z = grid.horizontal(), grid.vertical("front")[:, None]
-    for row, column in np.argwhere(cells != EMPTY):
-        middle = column + 0.5 - cells.shape[1] / 2
-        height = z - row
-        half = 0.5 if cells[row, column] == FULL else (1 - height) / 2
-        picture |= (0 <= height) & (height < 1) & (np.abs(x - middle) < half)
-    return picture
-
-
-def block_list(cells: Ints) -> Ints | None:
-    """(S,) counts: each run of full cells is covered with the longest blocks that fit; None if that takes too many.
-
-    >>> block_list(np.array([[1, 1, 1, 1], [0, 1, 2, 0]])).tolist()
-    [2, 0, 1, 1]
-    """
-    counts = np.zeros(len(PAPER_CATALOGUE), dtype=np.int64)
-    counts[PAPER_CATALOGUE.index("triangle")] = np.count_nonzero(cells == TRIANGLE)
-    for row in np.pad((cells == FULL).astype(int), ((0, 0), (1, 1))):
-        starts, ends = np.flatnonzero(np.diff(row) == 1), np.flatnonzero(np.diff(row) == -1)
-        for length in ends - starts:
-            for name, size in (("long_rectangle", 3), ("rectangle", 2), ("cube", 1)):
-                counts[PAPER_CATALOGUE.index(name)] += length // size
-                length %= size
-    return counts if 1 <= counts.sum() <= MAX_BLOCKS else None

@@ -15,7 +15,7 @@ import yaml
 import stackgen.robot.building as building
 from stackgen.commands import own_sections, parse
 from stackgen.commands.build import COMMAND, _seen
-from stackgen.geometry import PAPER_GRID
+from stackgen.geometry import PAPER_GRID, iou
 from stackgen.images import read_silhouette
 from stackgen.render import save_image
 from stackgen.robot.cell import Cell
@@ -130,6 +130,12 @@ def test_a_clean_picture_and_the_photo_of_an_outline_are_both_seen(tmp_path: Pat
     seen = _seen(file, PAPER_GRID)
     rows, columns = np.nonzero(seen)
     assert seen[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1].mean() > 0.9  # filled in
+
+
+def test_a_depth_frame_is_seen_as_capture_does() -> None:
+    seen = _seen(ROOT / "examples" / "photos" / "stack-house-depth.png", PAPER_GRID)
+    house = _seen(ROOT / "examples" / "photos" / "sketch-house.jpg", PAPER_GRID)
+    assert iou(seen, house) > 0.98  # the same house
 
 
 @pytest.mark.usefixtures("nothing_moves")

@@ -39,7 +39,17 @@ def truth(stack: Stack) -> np.ndarray:
     ],
 )
 def test_the_silhouette_is_that_of_the_stack(stack: Stack, rig: Rig) -> None:
-    assert iou(capture(simulated_frame(stack, rig)).silhouette, truth(stack)) >= 0.9
+    found = capture(simulated_frame(stack, rig))
+    assert iou(found.as_seen, truth(stack)) >= 0.9
+    assert iou(found.silhouette, truth(stack)) >= 0.98
+    assert found.counts is not None and found.left_out < 0.01
+
+
+def test_what_is_not_made_of_whole_cells_stays_as_seen() -> None:
+    poses = [[0.5 * z, 0, z + 0.5, 0, 0, 0] for z in range(4)]
+    steps = Stack(np.array([0, 1, 1, 1]), np.array(poses))
+    found = capture(simulated_frame(steps))
+    assert np.array_equal(found.silhouette, found.as_seen) and found.counts is None
 
 
 def test_sizes_are_in_metres() -> None:
@@ -54,7 +64,9 @@ def test_the_camera_may_stand_nearer_or_further() -> None:
 
 def test_a_block_beside_the_structure_is_left_out() -> None:
     beside = Stack(np.append(ARCH.shapes, 0), np.vstack([ARCH.poses, [3.2, 0, 0.5, 0, 0, 0]]))
-    assert iou(capture(simulated_frame(beside)).silhouette, truth(ARCH)) >= 0.9
+    found = capture(simulated_frame(beside))
+    assert iou(found.silhouette, truth(ARCH)) >= 0.9
+    assert found.left_out == pytest.approx(1 / 9, abs=0.03)  # a cube beside nine cells
 
 
 @pytest.mark.parametrize(("name", "stack"), [("stack-castle", CASTLE), ("stack-house", HOUSE)])

@@ -12,17 +12,8 @@ import pytest
 from stackgen.cli import main
 from stackgen.geometry import iou, silhouette
 from stackgen.images import read_silhouette
-from stackgen.robot.sketch import (
-    EMPTY,
-    FULL,
-    TRIANGLE,
-    block_list,
-    find_sheet,
-    occupancy,
-    picture_of,
-    read_sketch,
-    sheet_ratio,
-)
+from stackgen.robot.cells import EMPTY, FULL, TRIANGLE, block_list, occupancy, picture_of
+from stackgen.robot.sketch import find_sheet, read_sketch, sheet_ratio
 from stackgen.stack import StackgenError
 
 ROOT = Path(__file__).parents[2]
