@@ -70,6 +70,15 @@ def load_predictor(weights: str | Path = "default") -> BlockListPredictor:
     return _build(weights, card, tensors, _PREDICTORS, "block-list predictor")
 
 
+def role_of(weights: str | Path) -> str:
+    """`predictor` where a name, file or checkpoint of ours holds a block-list network, else `sampler`.
+
+    Raises:
+        StackgenError: If there is no such thing or it is damaged.
+    """
+    return "predictor" if read_weights(weights)[1].get("kind") in _PREDICTORS else "sampler"
+
+
 def read_weights(weights: str | Path, role: str = "sampler") -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Tensors and card behind a name or path; `role` says what `default` means.
 

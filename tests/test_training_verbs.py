@@ -203,6 +203,19 @@ def test_protocol_of_a_checkpoint_leaves_figures_for_both_lists_and_the_ceiling(
     assert run["dataset"]["path"] == str(towers_dataset) and len(run["dataset"]["sha256"]) == 64
 
 
+def test_a_block_list_network_is_tested_with_the_shipped_sampler(
+    cli: Cli, tiny: TinyWeights, towers_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    data = ["--data.path", towers_dataset, "--data.test_path", towers_dataset]
+    options = ["--model.weights", tiny.sampler, "--trainer.enable_progress_bar", "false"]
+    answer = cli("test", "--ckpt_path", tiny.predictor, *data, *options)
+    assert answer.code == 0, answer.err
+    asked = yaml.safe_load(Path("runs/run/test_0/config.yaml").read_text())["model"]["init_args"]
+    assert asked["weights"] == str(tiny.sampler) and asked["block_list_weights"] == str(tiny.predictor)
+    assert json.loads(Path("runs/run/test_0/metrics.json").read_text())["rows"][1]["block_list"] == "predicted"
+
+
 def test_predict_writes_a_stacks_file_for_each_scene(
     cli: Cli, config: Path, tiny: TinyWeights, towers_dataset: Path
 ) -> None:

@@ -255,24 +255,37 @@ def _complete(verb: str, arguments: list[str]) -> list[str]:
     """Fill in what goes without saying.
 
     `test` and `predict` are about weights unless another model is given, and ask them about the frozen
-    test set; for `fit` and `validate` the configuration lies beside a run's checkpoint.
+    test set: those of a sampler, or of a block-list network, with which the shipped sampler is asked. For `fit` and
+    `validate` the configuration lies beside a run's checkpoint.
     """
     for _, value in option_values(arguments, ("--ckpt_path", "--model.weights")):
         _check_binary(Path(value))
     given = [value for _, value in option_values(arguments, (*CONFIG_FLAGS, "--model"))]
+    checkpoints = [value for _, value in option_values(arguments, ("--ckpt_path",))]
     frozen = ["--data.path", str(TESTSET), "--data.eval_batch_size", "64"]
     if given:
         return [*frozen, *arguments] if verb in ("test", "predict") and any(map(_is_protocol, given)) else arguments
     if verb in ("test", "predict"):
         weights = ["--model", f"{WeightsUnderTest.__module__}.WeightsUnderTest", *frozen]
-        return [*weights, *(a.replace("--ckpt_path", "--model.weights", 1) for a in arguments)]
-    checkpoints = [value for _, value in option_values(arguments, ("--ckpt_path",))]
+        parts = [f"--model.{_WEIGHTS[_role(path)]}" for path in checkpoints[-1:]]
+        return [*weights, *(a.replace("--ckpt_path", parts[0], 1) if parts else a for a in arguments)]
     found = [path for path in (config_of(Path(checkpoint)) for checkpoint in checkpoints) if path]
     if not found:
         return arguments
     saved = yaml.safe_load(found[-1].read_text())
     asked = [key for key in saved if key != "ckpt_path"] if verb == "fit" else ["name", "model", "data"]
     return ["--config", yaml.safe_dump({key: saved[key] for key in asked}), *arguments]
+
+
+_WEIGHTS = {"sampler": "weights", "predictor": "block_list_weights"}
+"""Parameters of `WeightsUnderTest`, by what weights are of."""
+
+
+def _role(checkpoint: str) -> str:
+    """What weights are of; whoever loads them says what is wrong with a path."""
+    from stackgen.weights import role_of
+
+    return role_of(checkpoint) if Path(checkpoint).is_file() else "sampler"
 
 
 def _is_protocol(value: str) -> bool:

@@ -295,7 +295,9 @@ def load_npz(path: str | Path) -> tuple[dict[str, StackArrays], dict]:
         StackgenError: If the file is missing, broken, or not such a file.
     """
     if not is_remote(path) and not Path(path).exists():
-        raise StackgenError(f"no dataset at {path}")
+        raise StackgenError(
+            f"no dataset at {path}: `stackgen generate` makes a folder, `stackgen dataset export` a .npz of it"
+        )
     try:
         with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as file:
             fields = {name: file[name] for name in FIELDS}
