@@ -5,6 +5,7 @@ Legend: H x W pixels, rows and columns of cells from the lower left, S shapes.
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,19 +18,39 @@ Ints = NDArray[np.int64]
 EMPTY, FULL, TRIANGLE = range(3)
 """What a cell may be."""
 
+NEAR = 0.3
+"""How far from whole numbers the sides of what is made of whole cells may be [cell]."""
+
 
 def in_cells(silhouette: Mask, alike: float, grid: Grid = PAPER_GRID) -> tuple[Ints, Mask | None]:
     """What each cell is, and the silhouette (H, W) that those cells make.
 
     Args:
         silhouette: (H, W) on the grid, anywhere between its cell lines.
-        alike: IoU of the two from which on the first is taken to be made of whole cells; None comes else.
+        alike: IoU of the two, the first `stretched`, from which on it is taken to be made of whole cells; None comes else.
         grid: Of both.
     """
-    aligned = np.roll(silhouette, grid_offset(silhouette, grid), axis=1)
-    cells = occupancy(aligned, grid)
+    picture = stretched(silhouette, grid)
+    cells = occupancy(picture, grid)
     whole = picture_of(cells, grid)
-    return cells, read_silhouette(whole, grid, exact=False) if iou(whole, aligned) >= alike else None
+    return cells, read_silhouette(whole, grid, exact=False) if iou(whole, picture) >= alike else None
+
+
+def stretched(silhouette: Mask, grid: Grid = PAPER_GRID) -> Mask:
+    """The silhouette (H, W), its box stretched to whole cells where nearly so, its edges on the grid's cell lines.
+
+    Where a block sticks out, what was scaled to fit its width is too low, and half a cell looks like a triangle.
+    """
+    rows, columns = np.flatnonzero(silhouette.any(axis=1)), np.flatnonzero(silhouette.any(axis=0))
+    cut = silhouette[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    size = np.array(cut.shape) / grid.pixels_per_cell
+    near = np.maximum(np.round(size), 1)
+    height, width = np.round(np.where(np.abs(size - near) < NEAR, near, size) * grid.pixels_per_cell).astype(int)
+    bottom, left = round(grid.image_size - grid.ground_margin), (grid.image_size - width) // 2
+    picture = np.zeros_like(silhouette)
+    resized = cv2.resize(cut.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+    picture[bottom - height : bottom, left : left + width] = resized >= 0.5
+    return np.roll(picture, grid_offset(picture, grid), axis=1)
 
 
 def occupancy(silhouette: Mask, grid: Grid = PAPER_GRID) -> Ints:

@@ -12,9 +12,9 @@ import pytest
 from stackgen.cli import main
 from stackgen.geometry import iou, silhouette
 from stackgen.images import read_silhouette
-from stackgen.robot.cells import EMPTY, FULL, TRIANGLE, block_list, occupancy, picture_of
+from stackgen.robot.cells import EMPTY, FULL, TRIANGLE, block_list, in_cells, occupancy, picture_of
 from stackgen.robot.sketch import find_sheet, read_sketch, sheet_ratio
-from stackgen.stack import StackgenError
+from stackgen.stack import PAPER_CATALOGUE, Stack, StackgenError
 
 ROOT = Path(__file__).parents[2]
 PHOTOS = ROOT / "examples" / "photos"
@@ -78,6 +78,15 @@ def test_cells_and_their_picture_are_inverse() -> None:
         cells[np.minimum(top, 3)[0], 0] = FULL
         cells[3, 1] = TRIANGLE
         assert np.array_equal(occupancy(picture_of(cells)), cells)
+
+
+def test_blocks_that_stick_out_of_the_grid_make_no_triangles() -> None:
+    long, cells = PAPER_CATALOGUE.index("long_rectangle"), np.array([[1, 1, 1, 0], [0, 1, 1, 1]] * 2)
+    xs = [-0.65, 0.6, -0.5, 0.6]
+    poses = np.array([[x, 0, row + 0.5, 0, 0, 0] for row, x in enumerate(xs)])
+    found, whole = in_cells(read_silhouette(silhouette(Stack(np.full(4, long), poses)), exact=False), alike=0.85)
+    assert found.tolist() == cells.tolist()
+    assert whole is not None and np.array_equal(whole, picture_of(cells))
 
 
 @pytest.mark.parametrize(
