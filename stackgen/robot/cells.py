@@ -26,8 +26,9 @@ def in_cells(silhouette: Mask, alike: float, grid: Grid = PAPER_GRID) -> tuple[I
     """What each cell is, and the silhouette (H, W) that those cells make.
 
     Args:
-        silhouette: (H, W) on the grid, anywhere between its cell lines.
-        alike: IoU of the two, the first `stretched`, from which on it is taken to be made of whole cells; None comes else.
+        silhouette: (H, W) on the grid, anywhere between its cell lines, not empty.
+        alike: IoU of the two, the first `stretched`, from which on it is taken to be made of whole cells; else None
+            comes.
         grid: Of both.
     """
     picture = stretched(silhouette, grid)
