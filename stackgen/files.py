@@ -11,14 +11,15 @@ from stackgen.stack import StackgenError
 
 
 def write_atomically(path: str | Path, data: bytes) -> None:
-    """Write `data` under a temporary name in the same folder, then put it in the place of `path`.
+    """Write `data` under a temporary name in the same folder, made if missing, then put it in the place of `path`.
 
     Raises:
-        StackgenError: If the folder is missing, not writable or full; `path` is then as it was before.
+        StackgenError: If the folder cannot be made, is not writable or full; `path` is then as it was before.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.name[:200]}.{secrets.token_hex(4)}.tmp")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         try:
             with temporary.open("xb") as file:
                 file.write(data)

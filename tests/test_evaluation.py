@@ -197,8 +197,9 @@ def test_metrics_json_says_what_was_measured_and_how(some: Evaluation, tmp_path:
     }  # fmt: skip
     for estimate in found["metrics"].values():
         assert 0 <= estimate["low"] <= estimate["value"] <= estimate["high"] <= 1
-    with pytest.raises(StackgenError, match="nowhere"):
-        write_metrics(tmp_path / "nowhere" / "metrics.json", some)
+    write_metrics(tmp_path / "new" / "metrics.json", some)
+    with pytest.raises(StackgenError, match="cannot be written"):
+        write_metrics(tmp_path / "metrics.json" / "metrics.json", some)
 
 
 def test_the_scenes_file_adds_up_to_the_metrics(some: Evaluation, tmp_path: Path) -> None:

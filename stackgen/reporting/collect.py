@@ -204,10 +204,6 @@ def write_record(lines: Sequence[Line]) -> None:
         "training": row.training and asdict(row.training),
         "evaluations": [to_json(_thinned(line.evaluation), line.question) for line in lines],
     }
-    try:
-        row.recorded.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StackgenError(f"{row.recorded.parent} cannot be made: {error.strerror}") from error
     write_atomically(row.recorded, (json.dumps(content, allow_nan=False) + "\n").encode())
 
 

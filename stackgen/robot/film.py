@@ -31,12 +31,10 @@ def check_suffix(path: Path) -> None:
     """See that a film can be written under this name.
 
     Raises:
-        StackgenError: If the suffix is unknown, or there is no such folder.
+        StackgenError: If the suffix is unknown.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise StackgenError(f"--video {path}: films are written as {' or '.join(SUFFIXES)}; change the suffix")
-    if not path.absolute().parent.is_dir():
-        raise StackgenError(f"--video {path}: there is no folder {path.parent}")
 
 
 def picture(client: int, size: tuple[int, int] = (640, 480), near: bool = False) -> Picture:
@@ -113,6 +111,10 @@ class _Writer:
     """Writes frames under a temporary name, and puts the film in its place when it is finished."""
 
     def __init__(self, path: Path) -> None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StackgenError(f"--video {path}: cannot be written: {error.strerror or error}") from error
         self.path = path
         self.temporary = path.with_name(f".{path.stem[:100]}.{secrets.token_hex(4)}{path.suffix.lower()}")
         self._mp4: Any = None

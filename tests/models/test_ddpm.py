@@ -187,7 +187,8 @@ def test_a_killed_fit_goes_on_to_the_same_weights(compact: Path, tmp_path: Path)
     whole = fit(compact, tmp_path / "whole", steps=steps)
     script = tmp_path / "run.py"
     script.write_text(
-        "import torch; torch.set_num_threads(1)\nfrom pathlib import Path; from tests.models.test_ddpm import fit\n"
+        f"import torch; torch.set_num_threads({torch.get_num_threads()})  # others round otherwise\n"
+        "from pathlib import Path; from tests.models.test_ddpm import fit\n"
         f"fit(Path({str(compact)!r}), Path({str(tmp_path / 'killed')!r}), steps={steps})\n"
     )
     process = subprocess.Popen([sys.executable, str(script)], env=CHILD)
