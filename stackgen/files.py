@@ -32,3 +32,20 @@ def write_atomically(path: str | Path, data: bytes) -> None:
             raise
     except OSError as error:
         raise StackgenError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def require_folder(folder: Path, asked: str) -> None:
+    """See that a folder is there, or can be made, and be written to.
+
+    Args:
+        folder: The folder.
+        asked: What the user asked for, with which the message begins.
+
+    Raises:
+        StackgenError: If not.
+
+    >>> require_folder(Path("no-such-folder"), "--out no-such-folder")
+    """
+    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if path.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        raise StackgenError(f"{asked}: {there} is {'not writable' if there.is_dir() else 'not a folder'}")

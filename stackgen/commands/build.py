@@ -71,7 +71,7 @@ def main(
         noise_deg: How far they are turned: standard deviation [deg].
         seed: Of the noise, and with --from_image of the stacks.
         out: Folder for build.json, the report, stacks.json, what was built, and build.png, a picture of it.
-        video: Film the build: an .mp4 or a .gif.
+        video: Film the build: an .mp4 (H.264, which browsers play) or a .gif, eight times as fast as the arm.
         gui: Show the build in a window.
         cell: The robot's cell.
         execute: Have the real arm move; without it everything but that is done.
@@ -79,7 +79,7 @@ def main(
         resume: Go on with the next block of a real build that was interrupted.
         real: Who builds, and what a real arm needs.
     """
-    from stackgen.robot.film import check_suffix
+    from stackgen.robot.film import check_film
     from stackgen.robot.window import require_display
 
     if noise_mm < 0 or noise_deg < 0 or seed < 0:
@@ -88,7 +88,7 @@ def main(
     check_options(real, execute, yes, resume, only_simulated)
     placed = placed_before(out, resume)
     if video is not None:
-        check_suffix(video)
+        check_film(video)
     if gui:
         require_display()
     content, entries = (

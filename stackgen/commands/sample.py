@@ -19,6 +19,7 @@ from stackgen.api import DEFAULT, load
 from stackgen.commands import Command, Files
 from stackgen.commands.tables import add_entries, verdict_table
 from stackgen.export import write_glb
+from stackgen.files import require_folder
 from stackgen.models.sampler_config import SamplerConfig
 from stackgen.protocols import Judge
 from stackgen.render import contact_sheet, save_image
@@ -126,9 +127,7 @@ def result_folders(images: Sequence[Path], out: Path) -> list[Path]:
     >>> [folder.name for folder in result_folders([Path("a.png"), Path("b/a.jpg")], Path("no-such-folder"))]
     ['a', 'a-2']
     """
-    there = next(path for path in (out.absolute(), *out.absolute().parents) if path.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-        raise StackgenError(f"--out {out}: {there} is {'not writable' if there.is_dir() else 'not a folder'}")
+    require_folder(out, f"--out {out}")
     if len(images) == 1:
         return [out]
     names: list[str] = []

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import secrets
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stackgen.files import require_folder, write_atomically
 from stackgen.render import save_image
 from stackgen.robot.simulation import SimulatedArm
 from stackgen.sim.world import bullet
@@ -27,14 +27,15 @@ _WALL, _TABLE = (245, 245, 243), (222, 215, 203)
 _LAST = 1.5  # the finished stack is shown for so long at the end of a film [s]
 
 
-def check_suffix(path: Path) -> None:
+def check_film(path: Path) -> None:
     """See that a film can be written under this name.
 
     Raises:
-        StackgenError: If the suffix is unknown.
+        StackgenError: If the suffix is unknown, or there is no folder for it.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise StackgenError(f"--video {path}: films are written as {' or '.join(SUFFIXES)}; change the suffix")
+    require_folder(path.parent, f"--video {path}")
 
 
 def picture(client: int, size: tuple[int, int] = (640, 480), near: bool = False) -> Picture:
@@ -108,44 +109,45 @@ class Film:
 
 
 class _Writer:
-    """Writes frames under a temporary name, and puts the film in its place when it is finished."""
+    """Holds a film in memory, compressed, and writes it when it is finished."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StackgenError(f"--video {path}: cannot be written: {error.strerror or error}") from error
         self.path = path
-        self.temporary = path.with_name(f".{path.stem[:100]}.{secrets.token_hex(4)}{path.suffix.lower()}")
+        self._content = io.BytesIO()
         self._mp4: Any = None
         self._gif: list[Any] = []
 
     def add(self, frame: Picture) -> None:
-        """One more frame (H, W, 3)."""
+        """One more frame (H, W, 3); both even for an MP4."""
         if self.path.suffix.lower() == ".gif":
             from PIL import Image
 
             self._gif.append(Image.fromarray(frame).quantize(64))
             return
-        import cv2
+        import av
 
         if self._mp4 is None:
-            size = frame.shape[1], frame.shape[0]
-            self._mp4 = cv2.VideoWriter(str(self.temporary), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES, size)
-            if not self._mp4.isOpened():
-                raise StackgenError(f"--video {self.path}: no MP4 can be written there; try a .gif")
-        self._mp4.write(np.ascontiguousarray(frame[..., ::-1]))
+            self._mp4 = av.open(self._content, "w", format="mp4")
+            stream = self._mp4.add_stream("libx264", FRAMES)  # what browsers play
+            stream.height, stream.width = frame.shape[:2]
+            stream.pix_fmt = "yuv420p"
+        self._encode(av.VideoFrame.from_ndarray(frame, format="rgb24"))
+
+    def _encode(self, frame: Any) -> None:
+        """Take a frame, or with None what is still held back."""
+        self._mp4.mux(self._mp4.streams.video[0].encode(frame))
 
     def finish(self) -> None:
-        """Put the film in its place."""
-        try:
-            if self._mp4 is not None:
-                self._mp4.release()
-            elif self._gif:
-                first, *others = self._gif
-                first.save(self.temporary, save_all=True, append_images=others, duration=round(1000 / FRAMES), loop=0)
-            os.replace(self.temporary, self.path)
-        except OSError as error:
-            raise StackgenError(f"--video {self.path}: cannot be written: {error.strerror or error}") from error
-        finally:
-            self.temporary.unlink(missing_ok=True)
+        """Write the film.
+
+        Raises:
+            StackgenError: If it cannot be written.
+        """
+        if self._mp4 is not None:
+            self._encode(None)
+            self._mp4.close()
+        else:
+            first, *others = self._gif
+            duration = round(1000 / FRAMES)
+            first.save(self._content, format="GIF", save_all=True, append_images=others, duration=duration, loop=0)
+        write_atomically(self.path, self._content.getvalue())

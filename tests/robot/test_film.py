@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from stackgen.robot.film import SUFFIXES, _Writer, check_suffix, outlined, picture
+from stackgen.robot.film import SUFFIXES, _Writer, check_film, outlined, picture
 from stackgen.sim.physics import Physics
 from stackgen.sim.world import Mold, bullet, connect
 from stackgen.stack import PAPER_CATALOGUE, StackgenError
@@ -35,20 +35,20 @@ def levels(path: Path) -> list[float]:
             film.seek(number)
             found.append(float(np.asarray(film.convert("L")).mean()))
         return found
-    import cv2
+    import av
 
-    video, found = cv2.VideoCapture(str(path)), []
-    while True:
-        there, frame = video.read()
-        if not there:
-            return found
-        found.append(float(frame.mean()))
+    with av.open(str(path)) as video:
+        assert video.streams.video[0].codec_context.name == "h264"  # what browsers play
+        return [float(frame.to_ndarray(format="rgb24").mean()) for frame in video.decode(video=0)]
 
 
 def test_other_films_are_refused(tmp_path: Path) -> None:
-    check_suffix(tmp_path / "a.MP4")
+    check_film(tmp_path / "a.MP4")
     with pytest.raises(StackgenError, match=r"written as \.mp4 or \.gif"):
-        check_suffix(tmp_path / "a.mov")
+        check_film(tmp_path / "a.mov")
+    (tmp_path / "file").touch()
+    with pytest.raises(StackgenError, match="file is not a folder"):
+        check_film(tmp_path / "file" / "a.mp4")
 
 
 def test_the_camera_sees_a_block_in_front_of_the_table() -> None:
