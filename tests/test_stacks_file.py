@@ -264,4 +264,5 @@ def test_a_write_that_fails_leaves_the_old_file_and_nothing_else(
     assert path.read_text() == "old"
     monkeypatch.undo()
     with pytest.raises(StackgenError, match="cannot be written"):
-        write_stacks(tmp_path / "no" / "stacks.json", full())
+        write_stacks(path / "stacks.json", full())
+    write_stacks(tmp_path / "new" / "stacks.json", full())
