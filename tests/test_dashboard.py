@@ -134,6 +134,8 @@ def test_wandb_offline_writes_a_run_that_can_be_synced(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("WANDB_API_KEY", "x" * 40)
+    wandb.finish()  # the run of another test of this process
+    wandb.teardown()  # and what writes it, in the folder where it began
     Path("tiny.yaml").write_text(TINY.format(data=towers_dataset))
     answer = cli("fit", "--config", "tiny.yaml", "--dashboard", "wandb-offline")
     assert answer.code == 0, answer.err

@@ -79,7 +79,9 @@ def test_a_shard_is_read_with_webdataset_and_numpy_alone() -> None:
 
 
 @pytest.mark.parametrize("line", [line for page in PAGES for line in commands(page.read_text())])
-def test_the_commands_of_a_page_parse(line: str, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_commands_of_a_page_parse(
+    line: str, cli: Cli, no_new_metrics: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(ROOT)
     words = shlex.split(line)
     if words[:2] == ["python", "-m"] and words[2].startswith("benchmarks."):
