@@ -52,7 +52,7 @@ JOINT = 0.010
 """Parts of the structure nearer than this belong together [m]: between blocks side by side depth often fails."""
 
 ALIKE = 0.85
-"""IoU with the silhouette as seen from which on the structure is taken to be made of whole cells."""
+"""IoU with the silhouette as seen, stretched, from which on the structure is taken to be made of whole cells."""
 
 _EDGE = 0.12
 """Width of the strip along the picture's edge in which wall and table are looked for [share]."""

@@ -43,7 +43,7 @@ SPECK = 0.03
 """Parts under this share of the largest are dirt."""
 
 ALIKE = 0.75
-"""IoU with the drawing from which on the drawing is taken to be made of whole cells."""
+"""IoU with the drawing, stretched, from which on it is taken to be made of whole cells."""
 
 
 @dataclass(frozen=True)
