@@ -32,7 +32,6 @@ class Case:
     """One stack.
 
     Args:
-        rig: Where the camera stood.
         seen: IoU of each kind of silhouette with the stack's own.
         whole: Whether the structure was taken to be made of whole cells.
         left_out: What stood beside it, as a share of it.
@@ -40,7 +39,6 @@ class Case:
         again: IoU of its silhouette with the first stack's own.
     """
 
-    rig: Rig
     seen: tuple[float, ...]
     whole: bool
     left_out: float
@@ -84,9 +82,8 @@ def case(stack: Stack, rng: np.random.Generator, model: Model) -> Case:
     silhouettes = (found.as_seen, found.silhouette)
     best = [model.sample_verified(mask, 1, seed).entries[0] for mask in silhouettes]
     return Case(
-        rig,
         tuple(iou(mask, own) for mask in silhouettes),
-        found.counts is not None,
+        found.cells is not None,
         found.left_out,
         tuple(entry.verdict is not None and entry.verdict.stable for entry in best),
         tuple(iou(own_silhouette(entry.stack), own) for entry in best),

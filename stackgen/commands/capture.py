@@ -111,7 +111,7 @@ def _from_sketch(path: Path, freehand: bool) -> _Result:
 
     found = read_sketch(path)
     shown = found.drawn if freehand else found.silhouette
-    lines = _made_of(found.cells, found.counts, np.array_equal(found.silhouette, found.drawn))
+    lines = _made_of(found.cells, found.counts)
     return _Result(shown, _sketch_overlay(found.photo, found.sheet, shown), lines)
 
 
@@ -128,13 +128,13 @@ def _from_frame(frame: Frame, freehand: bool, name: str = "") -> _Result:
     lines = [f"structure: {1e3 * width:.0f} mm wide, {1e3 * height:.0f} mm high"]
     if found.left_out > _LEFT_OUT:
         lines.append(f"left out: what stands beside it and touches it nowhere, {found.left_out:.0%} of its size")
-    lines += _made_of(found.cells, found.counts, np.array_equal(found.silhouette, found.as_seen))
+    lines += _made_of(found.cells, found.counts)
     return _Result(shown, _frame_overlay(frame, found.seen, found.outline, shown), tuple(lines))
 
 
-def _made_of(cells: NDArray[np.int64], counts: NDArray[np.int64] | None, unchanged: bool) -> tuple[str, ...]:
+def _made_of(cells: NDArray[np.int64] | None, counts: NDArray[np.int64] | None) -> tuple[str, ...]:
     """Lines about the cells that were found."""
-    if unchanged and counts is None:
+    if cells is None:
         return ("not made of whole cells: the silhouette is as seen",)
     drawn = "\n".join("  " + "".join(".#^"[cell] for cell in row) for row in cells[::-1])
     lines = [f"cells:\n{drawn}"]

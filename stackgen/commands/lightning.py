@@ -34,7 +34,7 @@ from stackgen.data.shards import manifest_sha256
 from stackgen.files import write_atomically
 from stackgen.models.world import CHECKPOINT_KEY
 from stackgen.protocols import StabilityChecker
-from stackgen.runs import RUNS, code_version, config_of, last_checkpoint, new_run
+from stackgen.runs import RUNS, code_version, config_of, last_checkpoint, new_run, resolve_weights
 from stackgen.sim.physics import Physics
 from stackgen.stack import StackgenError
 from stackgen.sweeps.telling import TellSweep, in_a_sweep
@@ -267,8 +267,8 @@ def _complete(verb: str, arguments: list[str]) -> list[str]:
         return [*frozen, *arguments] if verb in ("test", "predict") and any(map(_is_protocol, given)) else arguments
     if verb in ("test", "predict"):
         weights = ["--model", f"{WeightsUnderTest.__module__}.WeightsUnderTest", *frozen]
-        parts = [f"--model.{_WEIGHTS[_role(path)]}" for path in checkpoints[-1:]]
-        return [*weights, *(a.replace("--ckpt_path", parts[0], 1) if parts else a for a in arguments)]
+        part = _part(checkpoints[-1]) if checkpoints else "weights"
+        return [*weights, *(a.replace("--ckpt_path", f"--model.{part}", 1) for a in arguments)]
     found = [path for path in (config_of(Path(checkpoint)) for checkpoint in checkpoints) if path]
     if not found:
         return arguments
@@ -277,15 +277,12 @@ def _complete(verb: str, arguments: list[str]) -> list[str]:
     return ["--config", yaml.safe_dump({key: saved[key] for key in asked}), *arguments]
 
 
-_WEIGHTS = {"sampler": "weights", "predictor": "block_list_weights"}
-"""Parameters of `WeightsUnderTest`, by what weights are of."""
-
-
-def _role(checkpoint: str) -> str:
-    """What weights are of; whoever loads them says what is wrong with a path."""
+def _part(checkpoint: str) -> str:
+    """The parameter of `WeightsUnderTest` that a checkpoint is for; whoever loads it says what is wrong with it."""
     from stackgen.weights import role_of
 
-    return role_of(checkpoint) if Path(checkpoint).is_file() else "sampler"
+    path = resolve_weights(checkpoint)
+    return "block_list_weights" if Path(path).is_file() and role_of(path) == "predictor" else "weights"
 
 
 def _is_protocol(value: str) -> bool:

@@ -118,8 +118,9 @@ class Capture:
     Args:
         silhouette: (H, W) on the grid: that of the cells where the structure is made of whole cells, else as seen.
         as_seen: (H, W) on the grid.
-        cells: (rows, columns) empty, full or triangle, the first row on the ground.
-        counts: (S,) block list by the heuristic; None where it is not made of whole cells, or of too many.
+        cells: (rows, columns) empty, full or triangle, the first row on the ground; None where it is not made of
+            whole cells.
+        counts: (S,) block list by the heuristic; None without cells, or with too many.
         seen: (H, W) of the frame: pixels of the structure.
         front: (h, w) the structure's front as seen straight on, `PIXEL` a pixel.
         outline: (4, 2) corners of that picture in the frame [pixel], from the upper left clockwise.
@@ -129,7 +130,7 @@ class Capture:
 
     silhouette: Mask
     as_seen: Mask
-    cells: Ints
+    cells: Ints | None
     counts: Ints | None
     seen: Mask
     front: Mask
@@ -160,10 +161,10 @@ def capture(frame: Frame, grid: Grid = PAPER_GRID) -> Capture:
     rows, columns = np.flatnonzero(front.any(axis=1)), np.flatnonzero(front.any(axis=0))
     size = (float(np.ptp(columns) + 1) * PIXEL, float(np.ptp(rows) + 1) * PIXEL)
     as_seen = read_silhouette(front, grid, exact=False)
-    cells, whole = in_cells(as_seen, ALIKE, grid)
-    counts = None if whole is None else block_list(cells)
+    cells, silhouette = in_cells(as_seen, ALIKE, grid) or (None, as_seen)
+    counts = None if cells is None else block_list(cells)
     left_out = np.count_nonzero(foreground & ~seen) / np.count_nonzero(seen)
-    return Capture(as_seen if whole is None else whole, as_seen, cells, counts, seen, front, outline, size, left_out)
+    return Capture(silhouette, as_seen, cells, counts, seen, front, outline, size, left_out)
 
 
 def read_frame(depth: str | Path, colour: str | Path | None = None, focal: float | None = None) -> Frame:

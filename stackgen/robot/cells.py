@@ -22,19 +22,18 @@ NEAR = 0.3
 """How far from whole numbers the sides of what is made of whole cells may be [cell]."""
 
 
-def in_cells(silhouette: Mask, alike: float, grid: Grid = PAPER_GRID) -> tuple[Ints, Mask | None]:
-    """What each cell is, and the silhouette (H, W) that those cells make.
+def in_cells(silhouette: Mask, alike: float, grid: Grid = PAPER_GRID) -> tuple[Ints, Mask] | None:
+    """What each cell is, and the silhouette (H, W) that those cells make; None if it is not made of whole cells.
 
     Args:
         silhouette: (H, W) on the grid, anywhere between its cell lines, not empty.
-        alike: IoU of the two, the first `stretched`, from which on it is taken to be made of whole cells; else None
-            comes.
+        alike: IoU of the two, the first `stretched`, from which on it is taken to be made of whole cells.
         grid: Of both.
     """
     picture = stretched(silhouette, grid)
     cells = occupancy(picture, grid)
     whole = picture_of(cells, grid)
-    return cells, read_silhouette(whole, grid, exact=False) if iou(whole, picture) >= alike else None
+    return (cells, read_silhouette(whole, grid, exact=False)) if iou(whole, picture) >= alike else None
 
 
 def stretched(silhouette: Mask, grid: Grid = PAPER_GRID) -> Mask:

@@ -53,8 +53,9 @@ class Sketch:
     Args:
         silhouette: (H, W) on the grid: that of the cells where the drawing is made of whole cells, else as drawn.
         drawn: (H, W) on the grid, as drawn.
-        cells: (rows, columns) EMPTY, FULL or TRIANGLE, the first row on the ground.
-        counts: (S,) block list by the heuristic; None where the drawing is not made of whole cells, or of too many.
+        cells: (rows, columns) EMPTY, FULL or TRIANGLE, the first row on the ground; None where the drawing is not
+            made of whole cells.
+        counts: (S,) block list by the heuristic; None without cells, or with too many.
         sheet: (4, 2) corners of the sheet in the photo [pixel], from the upper left clockwise.
         photo: (h, w, 3) at `WORK_SIZE`.
         ink: (h', w') the drawing on the sheet, filled in.
@@ -62,7 +63,7 @@ class Sketch:
 
     silhouette: Mask
     drawn: Mask
-    cells: Ints
+    cells: Ints | None
     counts: Ints | None
     sheet: Floats
     photo: Picture
@@ -91,9 +92,9 @@ def _sketch(photo: Picture, grid: Grid) -> Sketch:
     sheet = find_sheet(photo)
     ink = one_drawing(filled_in(binarised(straightened(photo, sheet))))
     drawn = read_silhouette(ink, grid, exact=False)
-    cells, whole = in_cells(drawn, ALIKE, grid)
-    counts = None if whole is None else block_list(cells)
-    return Sketch(drawn if whole is None else whole, drawn, cells, counts, sheet, photo, ink)
+    cells, silhouette = in_cells(drawn, ALIKE, grid) or (None, drawn)
+    counts = None if cells is None else block_list(cells)
+    return Sketch(silhouette, drawn, cells, counts, sheet, photo, ink)
 
 
 def _scaled(picture: Picture) -> Picture:

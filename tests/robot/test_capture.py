@@ -49,7 +49,7 @@ def test_what_is_not_made_of_whole_cells_stays_as_seen() -> None:
     poses = [[0.5 * z, 0, z + 0.5, 0, 0, 0] for z in range(4)]
     steps = Stack(np.array([0, 1, 1, 1]), np.array(poses))
     found = capture(simulated_frame(steps))
-    assert np.array_equal(found.silhouette, found.as_seen) and found.counts is None
+    assert np.array_equal(found.silhouette, found.as_seen) and found.cells is None and found.counts is None
 
 
 def test_sizes_are_in_metres() -> None:
