@@ -20,12 +20,13 @@ from benchmarks.common import argument_parser, plain_table, report, start
 from benchmarks.simulator import REFERENCE as FINE
 from benchmarks.simulator import Case, testset_stacks, with_noise, without_some
 from stackgen.data.generation.templates import draw_template, realize
+from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette
-from stackgen.sim.certificate import Certificate, PlaneStatics
+from stackgen.sim.checkers import fell
 from stackgen.sim.physics import Physics
-from stackgen.sim.verdict import fell
-from stackgen.sim.world import Simulator
-from stackgen.stack import Stack, StackgenError
+from stackgen.sim.simulator import Simulator
+from stackgen.sim.statics.plane import Certificate, PlaneStatics
+from stackgen.stack import Stack
 
 SLOW = Physics(time_step=1 / 240, solver_iterations=50, watch=4.0, rest_window=8.0)
 """Its window of rest is longer than its watch: it never stops early."""
@@ -93,7 +94,7 @@ def at_its_limit(stack: Stack, rng: np.random.Generator) -> Stack:
 
 def samples(stacks: Sequence[Stack], weights: str, seed: int) -> list[Stack]:
     """A sample of the model for each stack's silhouette and blocks."""
-    from stackgen.weights import load_sampler
+    from stackgen.models.weights import load_sampler
 
     pictures = np.stack([silhouette(stack) for stack in stacks])
     counts = np.stack([stack.counts for stack in stacks])

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 from benchmarks.common import argument_parser, plain_table, report, start
 
 if TYPE_CHECKING:
-    from stackgen.data.arrays import StackArrays
-    from stackgen.models.blocklist import BlockListNetwork
+    from stackgen.data.loading.arrays import StackArrays
+    from stackgen.models.block_list.network import BlockListNetwork
 
 HEADS = ("classes", "chain")
 
@@ -48,11 +48,10 @@ def measure(options: argparse.Namespace, head: str) -> dict[str, Any]:
     import numpy as np
     import torch
 
-    from stackgen.data.arrays import load_dataset
-    from stackgen.geometry import Grid
-    from stackgen.models.blocklist import BlockListNetwork, CNNConfig
-    from stackgen.stack import Catalogue
-    from stackgen.statistics import clustered_ratio
+    from stackgen.data.loading.arrays import load_dataset
+    from stackgen.evaluation.intervals import clustered_ratio
+    from stackgen.models.block_list.network import BlockListNetwork, CNNConfig
+    from stackgen.world import Catalogue, Grid
 
     splits, manifest = load_dataset(options.data, ("train", "validation"))
     torch.manual_seed(options.seed)

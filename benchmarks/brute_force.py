@@ -21,8 +21,8 @@ from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.baselines.brute_force import BruteForce
 from stackgen.baselines.heuristic import random_stream
 from stackgen.data.datamodule import TESTSET
-from stackgen.evaluation import Scene, load_scenes
-from stackgen.geometry import Mask
+from stackgen.evaluation.protocol import Scene, load_scenes
+from stackgen.world import Mask
 from tests.baselines.naive import naive_search
 
 Question = tuple[Mask, NDArray[np.int64]]
@@ -57,7 +57,7 @@ def main() -> None:
 
 def block_lists(scenes: Sequence[Scene], weights: str) -> dict[str, NDArray[np.int64]]:
     """(B, S) the true lists and the network's most likely ones."""
-    from stackgen.weights import load_predictor
+    from stackgen.models.weights import load_predictor
 
     pictures = np.stack([scene.silhouette for scene in scenes])
     parts = [

@@ -19,10 +19,11 @@ from rich.progress import track
 from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.data.generation.generate import TESTSET
 from stackgen.data.shards import Manifest
-from stackgen.robot.order import BuildOrder, TopDownJaws, plan_order
-from stackgen.sim.verdict import SimulatorChecker
-from stackgen.stack import Stack, StackgenError
-from stackgen.statistics import clustered_ratio
+from stackgen.errors import StackgenError
+from stackgen.evaluation.intervals import clustered_ratio
+from stackgen.robot.planning.order import BuildOrder, TopDownJaws, plan_order
+from stackgen.sim.checkers import SimulatorChecker
+from stackgen.stack import Stack
 
 ORDERS = ("paper", "safest, statics", "safest, simulator")
 

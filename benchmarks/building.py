@@ -21,15 +21,15 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common import argument_parser, plain_table, report, start
-from stackgen.aligned import AlignedSampler
 from stackgen.api import DEFAULT, load
-from stackgen.commands.progress import progress_bar
-from stackgen.data.arrays import load_dataset
+from stackgen.commands.progress_bar import progress_bar
 from stackgen.data.generation.generate import TESTSET
-from stackgen.evaluation import Scene, scenes_of
-from stackgen.robot.cell import Cell
-from stackgen.stack import StackgenError
-from stackgen.statistics import clustered_ratio
+from stackgen.data.loading.arrays import load_dataset
+from stackgen.errors import StackgenError
+from stackgen.evaluation.intervals import clustered_ratio
+from stackgen.evaluation.protocol import Scene, scenes_of
+from stackgen.robot.workcell import Cell
+from stackgen.sampling.alignment import AlignedSampler
 
 TURN = 1.0
 """Noise on the turn of the blocks wherever there is noise on their place [deg]."""
@@ -121,9 +121,9 @@ def performed(jobs: Sequence[tuple[Scene, float]], options: argparse.Namespace) 
 
 def one(job: tuple[Scene, float], seed: int, weights: str, grasp: Any) -> Record:
     """Draw a stack for a scene, build it, and say what became of it."""
-    from stackgen.robot.building import build, design
-    from stackgen.robot.planning import plan_build
-    from stackgen.robot.simulation import PickNoise
+    from stackgen.robot.build import build, design
+    from stackgen.robot.planning.plan import plan_build
+    from stackgen.robot.simulated.arm import PickNoise
 
     scene, noise = job
     model, cell = load(weights), Cell()

@@ -18,11 +18,13 @@ from rich.progress import track
 from benchmarks.build_order import drawn, estimate
 from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.api import Model, load
-from stackgen.geometry import Mask, iou, silhouette
-from stackgen.images import read_silhouette
-from stackgen.robot.capture import capture
-from stackgen.robot.capture_camera import Rig, simulated_frame
-from stackgen.stack import Stack, StackgenError
+from stackgen.errors import StackgenError
+from stackgen.geometry import iou, silhouette
+from stackgen.stack import Stack
+from stackgen.vision.cameras import Rig, simulated_frame
+from stackgen.vision.depth import capture
+from stackgen.vision.drawings import read_silhouette
+from stackgen.world import Mask
 
 KINDS = ("as seen", "in cells")
 

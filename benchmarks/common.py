@@ -22,8 +22,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from stackgen.files import write_atomically
-from stackgen.stack import StackgenError
+from stackgen.errors import StackgenError
+from stackgen.io.files import write_atomically
 
 ROOT = Path(__file__).parents[1]
 FORMAT = "stackgen.benchmark/1"

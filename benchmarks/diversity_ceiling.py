@@ -1,8 +1,8 @@
 """How diverse valid samples can be: all layouts of a block list that fill a silhouette and stand, counted.
 
 For scenes of testset-v1, evenly spread, with the true block list and with the CNN's. The search is exact
-(stackgen.layouts); a layout stands if PyBullet says so of one of its placements. How often the scene's own
-layout is found to stand tells how complete that is: it did stand when the scene was made.
+(stackgen.evaluation.diversity_limit); a layout stands if PyBullet says so of one of its placements. How often the
+scene's own layout is found to stand tells how complete that is: it did stand when the scene was made.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.data.generation.deconstruction import surely_falls
 from stackgen.data.generation.generate import TESTSET
 from stackgen.data.shards import manifest_sha256
-from stackgen.evaluation import Scene, load_scenes
-from stackgen.layouts import PLACEMENTS, Answers, answers, expected_diversity
-from stackgen.metrics import layout
+from stackgen.errors import StackgenError
+from stackgen.evaluation.diversity_limit import PLACEMENTS, Answers, answers, expected_diversity
+from stackgen.evaluation.intervals import Estimate, clustered_ratio
+from stackgen.evaluation.protocol import Scene, load_scenes
+from stackgen.evaluation.report.known import format_layout
+from stackgen.evaluation.results import PREDICTED_LIST, TRUE_LIST
+from stackgen.models.weights import load_predictor, resolve_weights
 from stackgen.protocols import Verdict
-from stackgen.reporting.known import format_layout
-from stackgen.results import PREDICTED_LIST, TRUE_LIST
-from stackgen.runs import resolve_weights
-from stackgen.sim.verdict import SimulatorChecker
-from stackgen.stack import Stack, StackgenError
-from stackgen.statistics import Estimate, clustered_ratio
-from stackgen.weights import load_predictor
+from stackgen.sampling.feasible import layout
+from stackgen.sim.checkers import SimulatorChecker
+from stackgen.stack import Stack
 
 SAMPLES = 3
 """Of the protocol."""

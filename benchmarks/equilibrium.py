@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.data.generation.generate import TESTSET
 from stackgen.data.shards import Manifest
+from stackgen.errors import StackgenError
+from stackgen.io.stacks_file import read_stacks
 from stackgen.protocols import Verdict
-from stackgen.sim.equilibrium import CONTACT_TOLERANCE, SAFETY, Equilibrium, EquilibriumChecker
-from stackgen.sim.verdict import SimulatorChecker
-from stackgen.stack import Stack, StackgenError
-from stackgen.stacks_file import read_stacks
+from stackgen.sim.checkers import SimulatorChecker
+from stackgen.sim.statics.checker import CONTACT_TOLERANCE, SAFETY, Equilibrium, EquilibriumChecker
+from stackgen.stack import Stack
 
 KINDS = ("settled", "less a block", "shaken")
 TOLERANCES = (0.02, 0.08, 0.2, CONTACT_TOLERANCE, 0.4)

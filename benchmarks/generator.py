@@ -22,11 +22,12 @@ from stackgen.data.generation.deconstruction import Judge, Settled, deconstruct,
 from stackgen.data.generation.generate import GenerateSettings, template_samples
 from stackgen.data.generation.templates import draw_template, realize
 from stackgen.data.shards import Sample, encode_shard
-from stackgen.sim.certificate import Certificate, Outcome
-from stackgen.sim.verdict import AcceptLimits, accept, fell
-from stackgen.sim.world import Rollout, Simulator
-from stackgen.stack import Stack, StackgenError
-from stackgen.statistics import clustered_ratio
+from stackgen.errors import StackgenError
+from stackgen.evaluation.intervals import clustered_ratio
+from stackgen.sim.checkers import AcceptLimits, accept, fell
+from stackgen.sim.simulator import Rollout, Simulator
+from stackgen.sim.statics.plane import Certificate, Outcome
+from stackgen.stack import Stack
 
 EVERY = 3
 """Of so many templates one is simulated throughout, too."""

@@ -23,7 +23,7 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.common import ROOT, argument_parser, plain_table, report, run_child, start
-from stackgen.stack import StackgenError
+from stackgen.errors import StackgenError
 
 KINDS = ("job", "parent", "worker")
 PATIENCE = 120.0

@@ -17,17 +17,19 @@ import numpy as np
 from scipy import ndimage
 
 from benchmarks.common import argument_parser, plain_table, report, start
-from stackgen.aligned import AlignedSampler
-from stackgen.files import write_atomically
-from stackgen.geometry import PAPER_GRID, Grid, Mask, silhouette
-from stackgen.images import grid_offset
+from stackgen.errors import StackgenError
+from stackgen.geometry import silhouette
+from stackgen.io.files import write_atomically
 from stackgen.protocols import StabilityChecker, StackSampler
-from stackgen.stack import Stack, StackgenError
+from stackgen.sampling.alignment import AlignedSampler
+from stackgen.stack import Stack
+from stackgen.vision.drawings import grid_offset
+from stackgen.world import PAPER_GRID, Grid, Mask
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from stackgen.evaluation import Scene
+    from stackgen.evaluation.protocol import Scene
     from stackgen.protocols import BlockListPredictor
 
 METRICS = ("stability", "front_iou", "iou_given_stable")
@@ -168,8 +170,8 @@ def scenes_of_kind(kind: str, scenes: Sequence[Scene], checker: StabilityChecker
     """What is asked for: fewer scenes where a disturbance has no sense, or what it leaves does not fit the picture."""
     from dataclasses import replace
 
-    from stackgen.evaluation import Scene
-    from stackgen.images import read_silhouette
+    from stackgen.evaluation.protocol import Scene
+    from stackgen.vision.drawings import read_silhouette
 
     if kind == EXAMPLES:
         files = sorted(DRAWINGS.iterdir())
@@ -207,9 +209,8 @@ class AlignedPredictor:
 
 def methods_of(options: argparse.Namespace, checker: StabilityChecker) -> dict[str, StackSampler]:
     """Whom to ask, by name."""
-    from stackgen.runs import resolve_weights
-    from stackgen.verification import Budget, VerifiedSampler
-    from stackgen.weights import load_sampler
+    from stackgen.models.weights import load_sampler, resolve_weights
+    from stackgen.sampling.verified import Budget, VerifiedSampler
 
     methods: dict[str, StackSampler] = {}
     for name in options.weights:
@@ -228,9 +229,9 @@ def main() -> None:
         raise StackgenError("--scenes and --num_samples must be at least 1")
     from stackgen.data.generation.generate import TESTSET
     from stackgen.data.shards import manifest_sha256
-    from stackgen.evaluation import evaluate, load_scenes, physics_of
-    from stackgen.sim.verdict import SimulatorChecker
-    from stackgen.weights import load_predictor
+    from stackgen.evaluation.protocol import evaluate, load_scenes, physics_of
+    from stackgen.models.weights import load_predictor
+    from stackgen.sim.checkers import SimulatorChecker
 
     everything, manifest = load_scenes(TESTSET)
     number = min(options.scenes, len(everything))

@@ -19,10 +19,10 @@ from typing import Any, get_args
 import numpy as np
 
 from benchmarks.common import argument_parser, plain_table, report, start
-from stackgen.files import write_atomically
-from stackgen.models.sampler_config import SamplerConfig
+from stackgen.errors import StackgenError
+from stackgen.io.files import write_atomically
+from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.protocols import Judge
-from stackgen.stack import StackgenError
 
 KINDS = {
     "ddpm": SamplerConfig("ddpm"),
@@ -100,9 +100,9 @@ def main() -> None:
     options = parser().parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `stackgen sample` has it; torch reads it when it is imported
     rows = rows_of(options)
-    from stackgen.evaluation import load_scenes, physics_of
-    from stackgen.sim.verdict import SimulatorChecker
-    from stackgen.weights import load_sampler
+    from stackgen.evaluation.protocol import load_scenes, physics_of
+    from stackgen.models.weights import load_sampler
+    from stackgen.sim.checkers import SimulatorChecker
 
     loaded: Any = load_sampler(options.weights)
     if not hasattr(loaded, "configured"):
@@ -135,8 +135,8 @@ def main() -> None:
 
 def measure(row: Row, sampler: Any, scenes: Sequence[Any], checker: Any, options: argparse.Namespace) -> dict[str, Any]:
     """Quality and time of a row."""
-    from stackgen.evaluation import evaluate
-    from stackgen.verification import Budget, VerifiedSampler, referee
+    from stackgen.evaluation.protocol import evaluate
+    from stackgen.sampling.verified import Budget, VerifiedSampler, referee
 
     if row.verify is not None:
         judge = referee(row.verify, checker)

@@ -19,10 +19,11 @@ from benchmarks.common import argument_parser, peak_rss_mb, plain_table, report,
 from stackgen.data.generation.generate import TESTSET
 from stackgen.data.generation.templates import draw_template, realize
 from stackgen.data.shards import Manifest
+from stackgen.errors import StackgenError
+from stackgen.sim.checkers import AcceptLimits, accept, fell
 from stackgen.sim.physics import Physics
-from stackgen.sim.verdict import AcceptLimits, accept, fell
-from stackgen.sim.world import Rollout, Simulator
-from stackgen.stack import Stack, StackgenError
+from stackgen.sim.simulator import Rollout, Simulator
+from stackgen.stack import Stack
 
 REFERENCE = Physics(time_step=1 / 960, solver_iterations=200, rest_window=0.25, rest_motion=2e-4, watch=4.0)
 """Twice the steps, three times the iterations, four times the window with a stricter rest, twice the watch.

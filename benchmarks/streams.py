@@ -142,10 +142,10 @@ def cpu_seconds() -> float:
 
 def reader(options: argparse.Namespace, path: str) -> tuple[int, Callable[[], int]]:
     """The number of stacks, and a function that reads them once and answers how many it saw."""
-    from stackgen.data.arrays import load_dataset
-    from stackgen.data.cached import CachedLoader
+    from stackgen.data.loading.arrays import load_dataset
+    from stackgen.data.loading.cached import CachedLoader
+    from stackgen.data.loading.streaming import ExactStream, TrainingStream
     from stackgen.data.shards import Manifest
-    from stackgen.data.streaming import ExactStream, TrainingStream
 
     folder, kind = str(options.data), path.partition(",")[0]
     count = Manifest.load(folder).count("train")

@@ -26,8 +26,8 @@ import yaml
 from benchmarks.common import ROOT, argument_parser, peak_rss_mb, plain_table, report, run_child, start
 
 if TYPE_CHECKING:
-    from stackgen.data.arrays import StackArrays
-    from stackgen.models.ddpm import DDPM
+    from stackgen.data.loading.arrays import StackArrays
+    from stackgen.models.diffusion.module import DDPM
 
 NETWORKS = ("config", "joint", "torch", "plain")
 ALLOCATOR = {"MALLOC_MMAP_THRESHOLD_": "2000000000", "MALLOC_TRIM_THRESHOLD_": "20000000000"}
@@ -101,9 +101,9 @@ def measure(options: argparse.Namespace, network: str, threads: int) -> dict[str
     import torch
     from lightning.pytorch import Trainer
 
-    from stackgen.callbacks import EMA
-    from stackgen.data.arrays import load_dataset
     from stackgen.data.datamodule import TESTSET
+    from stackgen.data.loading.arrays import load_dataset
+    from stackgen.training.callbacks import EMA
 
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     warnings.filterwarnings("ignore", module="lightning")
@@ -166,11 +166,11 @@ def build(init_args: dict[str, Any], network: str) -> DDPM:
     """The training module of a configuration, with its own network or one of the other two."""
     from torch import Tensor, nn
 
-    from stackgen.models.ddpm import DDPM
-    from stackgen.models.denoiser import DenoiserConfig
-    from stackgen.models.diffusion import DiffusionConfig
+    from stackgen.models.diffusion.denoiser import DenoiserConfig
+    from stackgen.models.diffusion.module import DDPM
+    from stackgen.models.diffusion.network import DiffusionConfig
+    from stackgen.models.diffusion.schedules import ScheduleConfig
     from stackgen.models.optimization import OptimizerConfig
-    from stackgen.models.schedules import ScheduleConfig
 
     denoiser = DenoiserConfig(**init_args["denoiser"])
     if network != "config":

@@ -14,14 +14,14 @@ from typing import Any
 from rich.console import Console
 
 from benchmarks.common import plain_table, start
-from stackgen.data.arrays import StackArrays, load_dataset
 from stackgen.data.generation.generate import TESTSET
-from stackgen.data.layouts_seen import seen_layouts
+from stackgen.data.inspection.seen_layouts import seen_layouts
+from stackgen.data.loading.arrays import StackArrays, load_dataset
 from stackgen.data.shards import manifest_sha256
-from stackgen.evaluation import scenes_of
-from stackgen.files import write_atomically
-from stackgen.reporting.known import SEEN_FILE, SEEN_FORMAT
-from stackgen.stack import StackgenError
+from stackgen.errors import StackgenError
+from stackgen.evaluation.protocol import scenes_of
+from stackgen.evaluation.report.known import SEEN_FILE, SEEN_FORMAT
+from stackgen.io.files import write_atomically
 
 NOTIONS = {"designs": True, "layouts": False}
 """Whether the cell in which each block begins counts."""

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.geometry import block_vertices
-from stackgen.robot.capture_camera import Rig, simulated_frame
 from stackgen.stack import Stack
+from stackgen.vision.cameras import Rig, simulated_frame
 
 Picture = NDArray[np.uint8]
 Floats = NDArray[np.float64]

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from stackgen.api import Model, load, sample
-    from stackgen.stack import Stack, StackgenError
+    from stackgen.errors import StackgenError
+    from stackgen.stack import Stack
 
 __all__ = ["Model", "Stack", "StackgenError", "load", "sample"]
 

@@ -2,7 +2,7 @@
 
 import sys
 
-from stackgen.cli import main
+from stackgen.commands.cli import main
 
 if __name__ == "__main__":
     sys.exit(main())

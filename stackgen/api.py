@@ -12,26 +12,20 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.aligned import AlignedSampler
-from stackgen.geometry import PAPER_GRID, Grid, Mask, silhouette_iou
-from stackgen.images import grid_offset, read_silhouette
-from stackgen.models.sampler_config import SamplerConfig
+from stackgen.errors import StackgenError
+from stackgen.geometry import silhouette_iou
+from stackgen.io.stacks_file import Entry, StacksFile, Weights
+from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.protocols import BlockListPredictor, Judge, StabilityChecker, StackSampler
-from stackgen.stack import (
-    MAX_BLOCKS,
-    PAPER_CATALOGUE,
-    Catalogue,
-    Stack,
-    StackgenError,
-    check_block_list,
-    parse_block_list,
-)
-from stackgen.stacks_file import Entry, StacksFile, Weights
+from stackgen.sampling.alignment import AlignedSampler
+from stackgen.stack import Stack, check_block_list, parse_block_list
+from stackgen.vision.drawings import grid_offset, read_silhouette
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
 
 if TYPE_CHECKING:
-    from stackgen.inventory import Inventory
+    from stackgen.sampling.inventory import Inventory
+    from stackgen.sampling.verified import Budget
     from stackgen.sim.physics import Physics
-    from stackgen.verification import Budget
 
 Silhouette = str | Path | NDArray[Any]
 """An image file; a (H, W) array, boolean with True where the structure is, or grey; or a colour (H, W, 3 or 4) one."""
@@ -149,7 +143,7 @@ class Model:
         budget: Budget | None = None,
         on_step: Callable[[], None] = lambda: None,
     ) -> StacksFile:
-        """Draw many stacks, have them judged, keep the best; see stackgen.verification.
+        """Draw many stacks, have them judged, keep the best; see stackgen.sampling.verified.
 
         Where fewer valid stacks than asked for stand with the most likely block list, the next likely ones
         are tried; a list that was given is never changed.
@@ -165,7 +159,7 @@ class Model:
             As :meth:`sample_checked`, the verdicts being the simulator's in any case. Its comment says what
             was drawn and judged, that of a stack whether nothing stable was found for it.
         """
-        from stackgen.verification import Budget, VerifiedSampler, choose_list, referee
+        from stackgen.sampling.verified import Budget, VerifiedSampler, choose_list, referee
 
         self._check_draw(num_samples, seed)
         mask, lists = self._scene(silhouette, blocks, inventory, top=_LISTS_TRIED)
@@ -226,7 +220,7 @@ class Model:
         Raises:
             StackgenError: On an unknown shape, a negative number, or no block at all.
         """
-        from stackgen.inventory import inventory_counts
+        from stackgen.sampling.inventory import inventory_counts
 
         return inventory_counts(inventory, self.catalogue)
 
@@ -261,7 +255,7 @@ class Model:
         aligned = np.roll(mask, grid_offset(mask, self.grid), axis=1)
         if inventory is None:
             return mask, self.predictor.predict(aligned[None], top=top)[0]
-        from stackgen.inventory import allowed_lists
+        from stackgen.sampling.inventory import allowed_lists
 
         ranks = None if self._predictor is None else lambda: self.predictor
         world = self.catalogue, self.grid, self.max_blocks
@@ -300,7 +294,7 @@ class Model:
         """What judges the stacks."""
         if self._checker is not None:
             return self._checker
-        from stackgen.sim.verdict import SimulatorChecker  # training machines have no PyBullet
+        from stackgen.sim.checkers import SimulatorChecker  # training machines have no PyBullet
 
         return SimulatorChecker(self.physics, self.catalogue)
 
@@ -342,8 +336,10 @@ def load(
     catalogue, grid = getattr(loaded_sampler, "catalogue", PAPER_CATALOGUE), getattr(loaded_sampler, "grid", PAPER_GRID)
 
     def predictor() -> BlockListPredictor:
-        from stackgen.runs import resolve_weights
-        from stackgen.weights import load_predictor  # imports torch
+        from stackgen.models.weights import (
+            load_predictor,  # imports torch
+            resolve_weights,
+        )
 
         loaded = load_predictor(resolve_weights(block_list_weights))
         other = cast(Trained, loaded)
@@ -362,8 +358,10 @@ def load(
 def _sampler(weights: str | Path | StackSampler, settings: SamplerConfig) -> tuple[StackSampler, Weights | None]:
     """The sampler, and the name and the hash of its weights (a heuristic's: of its settings)."""
     if isinstance(weights, str | Path):
-        from stackgen.runs import resolve_weights
-        from stackgen.weights import load_sampler  # imports torch
+        from stackgen.models.weights import (
+            load_sampler,  # imports torch
+            resolve_weights,
+        )
 
         file = resolve_weights(weights)
         loaded = load_sampler(file)

@@ -12,8 +12,8 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.geometry import Mask
 from stackgen.stack import Stack
+from stackgen.world import Mask
 
 
 @dataclass(frozen=True)

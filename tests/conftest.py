@@ -16,10 +16,10 @@ from hypothesis import settings
 from numpy.typing import NDArray
 
 from stackgen.api import Model
-from stackgen.cli import main
-from stackgen.geometry import Mask
-from stackgen.metrics import SCENE_METRICS
+from stackgen.commands.cli import main
+from stackgen.evaluation.metrics import SCENE_METRICS
 from stackgen.stack import Stack, shapes_of
+from stackgen.world import Mask
 
 settings.register_profile("patient", deadline=None)  # on a busy machine the slowest example says nothing
 settings.load_profile("patient")
@@ -117,11 +117,11 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> TinyWeights:
     """Files of networks that nobody trained, small enough to be fast."""
     import torch
 
-    from stackgen.models.blocklist import CNNConfig
-    from stackgen.models.cnn import BlockListCNN
-    from stackgen.models.ddpm import DDPM
-    from stackgen.models.denoiser import DenoiserConfig
-    from stackgen.weights import write_weights
+    from stackgen.models.block_list.module import BlockListCNN
+    from stackgen.models.block_list.network import CNNConfig
+    from stackgen.models.diffusion.denoiser import DenoiserConfig
+    from stackgen.models.diffusion.module import DDPM
+    from stackgen.models.weights import write_weights
 
     folder = tmp_path_factory.mktemp("weights")
     torch.manual_seed(0)
@@ -172,9 +172,9 @@ def towers_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def write_towers(folder: Path, sizes: dict[str, int]) -> Path:
     """Write a dataset of towers of one to three cubes, a shard for each split."""
     from stackgen.data.shards import Manifest, Sample, write_shard
-    from stackgen.geometry import PAPER_GRID, silhouette
+    from stackgen.geometry import silhouette
     from stackgen.sim.physics import Physics
-    from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE
+    from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID
 
     folder.mkdir(exist_ok=True)
     rng = np.random.default_rng(0)

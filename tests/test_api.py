@@ -11,11 +11,13 @@ from PIL import Image
 
 import stackgen
 from stackgen.api import Model, _configured, judge
-from stackgen.geometry import PAPER_GRID, Mask, mirror, silhouette
-from stackgen.models.sampler_config import SPACING, SamplerConfig
-from stackgen.stack import Stack, StackgenError
-from stackgen.stacks_file import read_stacks
-from stackgen.verification import Budget
+from stackgen.errors import StackgenError
+from stackgen.geometry import mirror, silhouette
+from stackgen.io.stacks_file import read_stacks
+from stackgen.models.diffusion.settings import SPACING, SamplerConfig
+from stackgen.sampling.verified import Budget
+from stackgen.stack import Stack
+from stackgen.world import PAPER_GRID, Mask
 from tests.conftest import Cli, TinyWeights
 
 

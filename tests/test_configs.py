@@ -15,15 +15,14 @@ from jsonargparse import ArgumentParser
 from lightning.pytorch import Callback, LightningModule
 from torch import nn
 
-from stackgen.cli import VERBS
-from stackgen.commands import own_sections, parse
+from stackgen.commands.cli import VERBS
 from stackgen.commands.generate import COMMAND as GENERATE
+from stackgen.commands.parsing import own_sections, parse
 from stackgen.data.datamodule import StackDataModule
 from stackgen.data.generation.generate import GenerateSettings
-from stackgen.models.cnn import BlockListCNN
-from stackgen.models.ddpm import DDPM
-from stackgen.runs import last_checkpoint
-from stackgen.weights import load_sampler
+from stackgen.models.block_list.module import BlockListCNN
+from stackgen.models.diffusion.module import DDPM
+from stackgen.models.weights import last_checkpoint, load_sampler
 from tests.conftest import Cli
 
 CONFIGS = Path(__file__).parents[1] / "configs"

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from stackgen.geometry import silhouette_iou, tilt
-from stackgen.images import read_silhouette
-from stackgen.sim.verdict import SimulatorChecker
-from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Stack
-from stackgen.stacks_file import read_stacks
+from stackgen.io.stacks_file import read_stacks
+from stackgen.sim.checkers import SimulatorChecker
+from stackgen.stack import Stack
+from stackgen.vision.drawings import read_silhouette
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 WORD = {"c": "cube", "r": "rectangle", "l": "long_rectangle", "t": "triangle"}

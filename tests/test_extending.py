@@ -13,9 +13,9 @@ import yaml
 
 from stackgen.commands.generate import COMMAND as GENERATE
 from stackgen.data.generation.generate import GenerateSettings
-from stackgen.metrics import SampleScore, SceneScore, scene_metrics
-from stackgen.results import METRICS
-from stackgen.runs import last_checkpoint
+from stackgen.evaluation.metrics import SampleScore, SceneScore, scene_metrics
+from stackgen.evaluation.results import METRICS
+from stackgen.models.weights import last_checkpoint
 from tests.conftest import Cli, TinyWeights
 
 ROOT = Path(__file__).parents[1]

@@ -9,10 +9,6 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from stackgen.geometry import (
-    PAPER_GRID,
-    VIEWS,
-    Grid,
-    View,
     block_vertices,
     centers_of_mass,
     iou,
@@ -23,7 +19,8 @@ from stackgen.geometry import (
     silhouette_iou,
     tilt,
 )
-from stackgen.stack import PAPER_CATALOGUE, Stack
+from stackgen.stack import Stack
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, VIEWS, Grid, View
 
 FINE = Grid(image_size=1200, pixels_per_cell=200.0, ground_margin=100.0)
 AXES = {"front": 1, "side": 0, "top": 2}

@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 import stackgen
-from stackgen.cli import VERBS
+from stackgen.commands.cli import VERBS
 from tests.conftest import Cli
 
 ROOT = Path(__file__).parents[1]

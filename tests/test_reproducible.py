@@ -10,7 +10,7 @@ import pytest
 import torch
 import yaml
 
-from stackgen.models.ddpm import DDPM
+from stackgen.models.diffusion.module import DDPM
 from tests.conftest import Cli
 
 CONFIG = """
@@ -23,11 +23,11 @@ trainer:
   enable_progress_bar: false
   enable_model_summary: false
   callbacks:
-    - {{class_path: stackgen.callbacks.EMA, init_args: {{decay: 0.9}}}}
+    - {{class_path: stackgen.training.callbacks.EMA, init_args: {{decay: 0.9}}}}
     - class_path: lightning.pytorch.callbacks.ModelCheckpoint
       init_args: {{every_n_train_steps: 4, save_top_k: -1, save_last: true, filename: "{{step}}"}}
 model:
-  class_path: stackgen.models.ddpm.DDPM
+  class_path: stackgen.models.diffusion.module.DDPM
   init_args:
     denoiser: {{width: 32, layers: 1, heads: 2, feedforward: 64, conditioning: cross, memory_layers: 1,
                mask_padding: true, ordered: true, self_conditioning: true}}

@@ -10,18 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stackgen.stack import (
-    MAX_BLOCKS,
-    PAPER_CATALOGUE,
-    Catalogue,
-    Shape,
-    Stack,
-    StackgenError,
-    check_block_list,
-    format_block_list,
-    parse_block_list,
-    shapes_of,
-)
+from stackgen.errors import StackgenError
+from stackgen.stack import Stack, check_block_list, format_block_list, parse_block_list, shapes_of
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Shape
 
 SQUARE = ((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5))
 STAR = tuple((math.sin(4 * math.pi * k / 5), math.cos(4 * math.pi * k / 5)) for k in range(5, 0, -1))

@@ -9,10 +9,10 @@ import pytest
 
 from stackgen.data.datamodule import TESTSET
 from stackgen.data.shards import SPLITS, Manifest, Sample
-from stackgen.geometry import PAPER_GRID, block_vertices, silhouette
+from stackgen.geometry import block_vertices, silhouette
+from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
-from stackgen.sim.verdict import SimulatorChecker
-from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID
 
 SHA256 = "c3adc506167a5404589a6acd1d3cdc03343a4c85f68971a12d470aede965fbc0"
 """Of its shard. It never changes: every figure ever published with its name would mean something else."""

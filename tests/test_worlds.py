@@ -13,13 +13,15 @@ import yaml
 from stackgen.data.generation.generate import GenerateSettings, template_samples
 from stackgen.data.generation.templates import Template, TemplateSettings, cells_wide, draw_template, realize
 from stackgen.data.shards import Manifest, Sample, write_shard
-from stackgen.geometry import PAPER_GRID, Grid, mirror, silhouette
-from stackgen.images import grid_offset
-from stackgen.render import save_image
-from stackgen.runs import last_checkpoint
+from stackgen.errors import StackgenError
+from stackgen.geometry import mirror, silhouette
+from stackgen.models.weights import last_checkpoint
 from stackgen.sim.physics import Physics
-from stackgen.sim.world import Simulator
-from stackgen.stack import Catalogue, Stack, StackgenError
+from stackgen.sim.simulator import Simulator
+from stackgen.stack import Stack
+from stackgen.vision.drawings import grid_offset
+from stackgen.viz.render import save_image
+from stackgen.world import PAPER_GRID, Catalogue, Grid
 from tests.conftest import Cli
 from tests.test_configs import settings_of
 

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.geometry import PAPER_GRID, Mask
-from stackgen.stack import PAPER_CATALOGUE, Stack, shapes_of
+from stackgen.stack import Stack, shapes_of
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Mask
 
 
 class Columns:

@@ -1,7 +1,7 @@
 """A metric of your own: how often at least one of a scene's samples stands and matches."""
 
-from stackgen.callbacks import SampleQuality
-from stackgen.metrics import SCENE_METRICS, SceneScore
+from stackgen.evaluation.metrics import SCENE_METRICS, SceneScore
+from stackgen.training.callbacks import SampleQuality
 
 
 def best_of_all(scene: SceneScore) -> tuple[float, float]:

@@ -4,8 +4,8 @@ import torch
 from torch import Tensor
 
 from stackgen._lightning import pl
-from stackgen.models.denoiser import mlp, raster_order
-from stackgen.models.world import WorldMixin
+from stackgen.models.diffusion.denoiser import mlp, raster_order
+from stackgen.models.module import WorldMixin
 
 
 class SilhouetteMLP(WorldMixin, pl.LightningModule):

@@ -5,8 +5,9 @@ import torch
 from numpy.typing import NDArray
 
 from examples.extending.model import SilhouetteMLP
-from stackgen.geometry import Mask
-from stackgen.stack import Stack, StackgenError, shapes_of
+from stackgen.errors import StackgenError
+from stackgen.stack import Stack, shapes_of
+from stackgen.world import Mask
 
 
 class MLPSampler:

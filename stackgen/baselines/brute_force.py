@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from stackgen.baselines.heuristic import Heuristic
 from stackgen.baselines.swap import swap
 from stackgen.baselines.upright import running_sums, span
-from stackgen.geometry import PAPER_GRID, Floats, Grid, Mask
-from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Stack, StackgenError
+from stackgen.errors import StackgenError
+from stackgen.geometry import Floats
+from stackgen.stack import Stack
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
 
 Integers = NDArray[np.int64]
 

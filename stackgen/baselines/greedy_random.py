@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from stackgen.baselines.heuristic import Heuristic, section
 from stackgen.baselines.swap import swap
-from stackgen.geometry import PAPER_GRID, Grid, Mask
-from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Stack, StackgenError, shapes_of
+from stackgen.errors import StackgenError
+from stackgen.stack import Stack, shapes_of
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
 
 Run = tuple[float, float]
 

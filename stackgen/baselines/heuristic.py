@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.geometry import PAPER_GRID, Grid, Mask, row_intervals
-from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Shape, Stack, StackgenError, check_block_list
+from stackgen.errors import StackgenError
+from stackgen.geometry import row_intervals
+from stackgen.stack import Stack, check_block_list
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask, Shape
 
 
 class Heuristic(ABC):

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.baselines.heuristic import Heuristic
-from stackgen.geometry import Mask
 from stackgen.stack import Stack, shapes_of
+from stackgen.world import Mask
 
 Interval = tuple[float, float]
 

@@ -1,52 +1,130 @@
-"""Training Tran-VAE: a thin Lightning shell around PoseVAE."""
+"""Tran-VAE's network: a conditional variational autoencoder of poses (paper, "Transformer-VAE Baseline").
+
+Two layers read a stack and say what its layout is, one latent vector (the posterior); four layers
+make poses of shapes, silhouette and latent vector. Without the stack, the latent vector is drawn
+from N(0, I). The paper gives the numbers of layers; latent size and weight of the divergence are ours.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from stackgen.baselines.training import Parts, PoseBaseline
-from stackgen.baselines.transformer import RegressionConfig
-from stackgen.baselines.vae import PoseVAE, VAEConfig
-from stackgen.models.denoiser import DenoiserConfig
-from stackgen.models.optimization import OptimizerConfig
+from stackgen.baselines.transformer import BlockTokens, PoseNetwork, RegressionConfig, Trunk
+from stackgen.errors import StackgenError
+from stackgen.models.diffusion.denoiser import POSE, DenoiserConfig, mlp
+from stackgen.world import MAX_BLOCKS
 
 
-class TranVAE(PoseBaseline):
-    """The paper's Transformer-VAE baseline; the defaults are the paper's where it gives them.
+@dataclass(frozen=True)
+class VAEConfig:
+    """Of the autoencoder.
 
     Args:
-        transformer: Architecture, the same as the denoiser's; its layers are shared by encoder and decoder.
-        regression: How reconstructed poses are compared with the true ones.
-        vae: Latent vector and its divergence.
-        optimizer: Learning rate and its course.
+        encoder_layers: How many of the Transformer's layers read the stack; the others make poses (paper: 2 and 4).
+        latent: Size of the latent vector.
+        kl_weight: Of the divergence from N(0, I) [1 / nat], beside an error averaged over blocks and
+            dimensions. With k blocks, Gaussian poses of variance v would make it v / (3 k).
+        kl_warmup: Training steps in which the weight rises from zero, so that the latent vector is put
+            to use before it is taxed.
     """
 
-    kind = "tran-vae"
+    encoder_layers: int = 2
+    latent: int = 32
+    kl_weight: float = 0.003
+    kl_warmup: int = 1000
+
+    def weight(self, step: int) -> float:
+        """Weight of the divergence at a training step.
+
+        >>> [VAEConfig(kl_weight=0.01, kl_warmup=100).weight(step) for step in (0, 50, 200)]
+        [0.0, 0.005, 0.01]
+        """
+        return self.kl_weight * min(1.0, step / max(1, self.kl_warmup))
+
+
+class Losses(NamedTuple):
+    """Of each stack (B,): the error of its reconstruction, and the divergence of its posterior [nat]."""
+
+    error: Tensor
+    divergence: Tensor
+
+
+class PoseVAE(PoseNetwork):
+    """Encoder, latent vector and decoder.
+
+    Args:
+        transformer: Architecture, described as the denoiser's; `layers` are those of encoder and decoder together.
+        regression: See RegressionConfig.
+        vae: See VAEConfig.
+        num_shapes: Size of the catalogue.
+        image_size: Edge of the silhouette [pixel].
+        max_blocks: N.
+
+    Raises:
+        StackgenError: If encoder or decoder would have no layer.
+    """
 
     def __init__(
         self,
-        transformer: DenoiserConfig = DenoiserConfig(),  # noqa: B008 - frozen
-        regression: RegressionConfig = RegressionConfig(),  # noqa: B008
-        vae: VAEConfig = VAEConfig(),  # noqa: B008
-        optimizer: OptimizerConfig = OptimizerConfig(),  # noqa: B008
+        transformer: DenoiserConfig,
+        regression: RegressionConfig,
+        vae: VAEConfig,
+        num_shapes: int = 4,
+        image_size: int = 64,
+        max_blocks: int = MAX_BLOCKS,
     ) -> None:
-        config = {"transformer": asdict(transformer), "regression": asdict(regression), "vae": asdict(vae)}
-        super().__init__(config, optimizer)
-        self._parts = (transformer, regression, vae)
-        self.model: PoseVAE
+        super().__init__(transformer, regression, num_shapes, image_size, max_blocks)
+        if not 0 < vae.encoder_layers < transformer.layers:
+            raise StackgenError(
+                f"Tran-VAE: encoder_layers must leave some of the {transformer.layers} layers to the decoder, "
+                f"got {vae.encoder_layers}"
+            )
+        self.config = vae
+        d = transformer.width
+        self.encoder_blocks = BlockTokens(transformer, num_shapes, max_blocks)
+        self.pose_embedding = mlp(POSE, d, d)
+        self.encoder = Trunk(transformer, vae.encoder_layers, conditioned=False)
+        self.posterior = nn.Linear(d, 2 * vae.latent)
+        self.latent_embedding = mlp(vae.latent, d, d)
+        self.decoder = Trunk(transformer, transformer.layers - vae.encoder_layers, conditioned=True)
 
-    def build(self) -> None:
-        """Make the network once its world is known."""
-        if not hasattr(self, "model"):
-            self.model = PoseVAE(*self._parts, len(self.catalogue), self.grid.image_size, self.max_blocks)
+    def encode(self, poses: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log variance (B, latent) of the posterior of normalised poses (B, N, 6)."""
+        tokens = self.encoder_blocks(shapes) + self.pose_embedding(poses)
+        tokens = self.encoder(tokens, mask, memory) * mask[..., None]
+        mean, log_variance = self.posterior(tokens.sum(1) / mask.sum(-1, keepdim=True)).chunk(2, dim=-1)
+        return mean, log_variance.clamp(-10.0, 10.0)
 
-    def _loss(self, batch: dict[str, Tensor], generator: torch.Generator | None = None) -> tuple[Tensor, Parts]:
-        """The error plus the weighted divergence; its weight rises in training, and is the last one elsewhere."""
-        losses = self.model.losses(batch, generator)
-        error, divergence = losses.error.mean(), losses.divergence.mean()
-        vae = self.model.config
-        weight = vae.weight(self.global_step) if self.training else vae.kl_weight
-        return error + weight * divergence, {"error": error, "divergence": divergence}
+    def decode(self, latent: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor) -> Tensor:
+        """Normalised poses (B, N, 6) for latent vectors (B, latent)."""
+        return self.head(self.decoder(self.blocks(shapes), mask, memory, self.latent_embedding(latent)))
+
+    def losses(self, batch: dict[str, Tensor], generator: torch.Generator | None = None) -> Losses:
+        """The two parts of the evidence bound (Kingma & Welling 2014), one draw of the posterior each.
+
+        Args:
+            batch: As the DataModule makes it.
+            generator: Of order and latent vectors; the global one by default.
+        """
+        shapes, mask, poses = self.scene(batch, generator)
+        memory = self.silhouette(batch["silhouette"])
+        mean, log_variance = self.encode(poses, shapes, mask, memory)
+        latent = mean + (0.5 * log_variance).exp() * self._noise(mean.shape, mean, generator)
+        error = self.error(self.decode(latent, shapes, mask, memory), poses, shapes, mask)
+        divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1)
+        return Losses(error, divergence)
+
+    def draw(self, shapes: Tensor, mask: Tensor, memory: Tensor, generator: torch.Generator) -> Tensor:
+        """See PoseNetwork; latent vectors from N(0, I)."""
+        latent = self._noise((len(shapes), self.config.latent), memory, generator)
+        return self.decode(latent, shapes, mask, memory)
+
+    @staticmethod
+    def _noise(size: tuple[int, ...], like: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Of N(0, 1), with another tensor's type and device."""
+        device = generator.device if generator is not None else like.device
+        return torch.randn(size, generator=generator, device=device).to(like)

@@ -20,8 +20,8 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from stackgen.geometry import Mask
-from stackgen.models.denoiser import (
+from stackgen.errors import StackgenError
+from stackgen.models.diffusion.denoiser import (
     POSE,
     CrossLayer,
     DenoiserConfig,
@@ -32,7 +32,8 @@ from stackgen.models.denoiser import (
     sinusoids,
 )
 from stackgen.models.network_sampler import NetworkSampler
-from stackgen.stack import MAX_BLOCKS, Stack, StackgenError
+from stackgen.stack import Stack
+from stackgen.world import MAX_BLOCKS, Mask
 
 _FORBIDDEN = 1e6  # cost of giving a block another shape's pose
 

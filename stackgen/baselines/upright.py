@@ -15,8 +15,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stackgen.geometry import Floats, Grid, row_intervals
-from stackgen.stack import Shape
+from stackgen.geometry import Floats, row_intervals
+from stackgen.world import Grid, Shape
 
 Integers = NDArray[np.int64]
 

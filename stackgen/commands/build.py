@@ -14,20 +14,22 @@ from rich.console import Console
 from rich.table import Table
 
 from stackgen.api import DEFAULT
-from stackgen.commands import Command, Files
-from stackgen.commands.progress import progress_bar
-from stackgen.commands.real import RealArm, build_for_real, check_options, placed_before, write_sheet
-from stackgen.files import write_atomically
-from stackgen.geometry import Grid, Mask, iou
-from stackgen.robot.cell import Cell, Grasp
-from stackgen.robot.kinematics import SolverName
-from stackgen.robot.order import Strategy
-from stackgen.stack import StackgenError, format_block_list
-from stackgen.stacks_file import Entry, StacksFile, read_stacks, write_stacks
+from stackgen.commands.parsing import Command, Files
+from stackgen.commands.progress_bar import progress_bar
+from stackgen.commands.real_arm import RealArm, build_for_real, check_options, placed_before, write_sheet
+from stackgen.errors import StackgenError
+from stackgen.geometry import iou
+from stackgen.io.files import write_atomically
+from stackgen.io.stacks_file import Entry, StacksFile, read_stacks, write_stacks
+from stackgen.robot.planning.kinematics import SolverName
+from stackgen.robot.planning.order import Strategy
+from stackgen.robot.workcell import Cell, Grasp
+from stackgen.stack import format_block_list
+from stackgen.world import Grid, Mask
 
 if TYPE_CHECKING:
-    from stackgen.robot.building import Design
-    from stackgen.robot.planning import BuildPlan
+    from stackgen.robot.build import Design
+    from stackgen.robot.planning.plan import BuildPlan
     from stackgen.robot.report import BuildReport
     from stackgen.sim.physics import Physics
 
@@ -79,8 +81,8 @@ def main(
         resume: Go on with the next block of a real build that was interrupted.
         real: Who builds, and what a real arm needs.
     """
-    from stackgen.robot.film import check_film
-    from stackgen.robot.window import require_display
+    from stackgen.robot.simulated.film import check_film
+    from stackgen.robot.simulated.window import require_display
 
     if noise_mm < 0 or noise_deg < 0 or seed < 0:
         raise StackgenError("--noise_mm, --noise_deg and --seed must be at least 0")
@@ -138,7 +140,7 @@ def _from_image(
     if file is not None:
         raise StackgenError(f"give {file} or --from_image {image}, not both")
     from stackgen.api import load
-    from stackgen.verification import Budget
+    from stackgen.sampling.verified import Budget
 
     model = load(weights)
     seen = _seen(image, model.grid)
@@ -169,9 +171,9 @@ def _seen(image: Path, grid: Grid) -> Mask:
     A clean picture is read by its colours; that fails, or sees something else, where light is uneven or only the
     outline is drawn: then it is a sketch.
     """
-    from stackgen.images import read_silhouette
-    from stackgen.robot.capture import capture, is_depth, read_frame
-    from stackgen.robot.sketch import read_sketch
+    from stackgen.vision.depth import capture, is_depth, read_frame
+    from stackgen.vision.drawings import read_silhouette
+    from stackgen.vision.sketches import read_sketch
 
     if is_depth(image):
         return capture(read_frame(image), grid).silhouette
@@ -200,8 +202,8 @@ def _planned(
     Raises:
         StackgenError: If none can; it says why of the first.
     """
-    from stackgen.robot.building import design
-    from stackgen.robot.planning import plan_build
+    from stackgen.robot.build import design
+    from stackgen.robot.planning.plan import plan_build
 
     reasons = []
     for entry in entries:
@@ -228,9 +230,9 @@ def _built(
     picture: Path,
     video: Path | None,
 ) -> BuildReport:
-    from stackgen.robot.building import build
-    from stackgen.robot.film import Film
-    from stackgen.robot.simulation import PickNoise
+    from stackgen.robot.build import build
+    from stackgen.robot.simulated.arm import PickNoise
+    from stackgen.robot.simulated.film import Film
 
     with progress_bar("build", len(wanted.stack)) as (advance, _):
         return build(

@@ -10,15 +10,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.commands import Command
-from stackgen.files import write_atomically
-from stackgen.geometry import PAPER_GRID, Mask, iou, silhouette
-from stackgen.images import read_silhouette
-from stackgen.stack import StackgenError, format_block_list
-from stackgen.stacks_file import read_stacks
+from stackgen.commands.parsing import Command
+from stackgen.errors import StackgenError
+from stackgen.geometry import iou, silhouette
+from stackgen.io.files import write_atomically
+from stackgen.io.stacks_file import read_stacks
+from stackgen.stack import format_block_list
+from stackgen.vision.drawings import read_silhouette
+from stackgen.world import PAPER_GRID, Mask
 
 if TYPE_CHECKING:
-    from stackgen.robot.capture import Frame
+    from stackgen.vision.depth import Frame
 
 Picture = NDArray[np.uint8]
 
@@ -87,11 +89,11 @@ def main(
         expected = expected_of_stack if expected is None else expected
         result = _from_frame(frame, freehand)
     elif depth:
-        from stackgen.robot.capture import read_frame
+        from stackgen.vision.depth import read_frame
 
         result = _from_frame(read_frame(depth, color, focal), freehand, str(depth))
     else:
-        from stackgen.robot.capture_camera import realsense_frame
+        from stackgen.vision.cameras import realsense_frame
 
         result = _from_frame(realsense_frame(), freehand)
     _write(result, out, overlay or out.with_name(f"{out.stem}-overlay.png"))
@@ -107,7 +109,7 @@ def main(
 
 def _from_sketch(path: Path, freehand: bool) -> _Result:
     """The drawing in a photo."""
-    from stackgen.robot.sketch import read_sketch
+    from stackgen.vision.sketches import read_sketch
 
     found = read_sketch(path)
     shown = found.drawn if freehand else found.silhouette
@@ -117,7 +119,7 @@ def _from_sketch(path: Path, freehand: bool) -> _Result:
 
 def _from_frame(frame: Frame, freehand: bool, name: str = "") -> _Result:
     """The structure in a frame."""
-    from stackgen.robot.capture import capture
+    from stackgen.vision.depth import capture
 
     try:
         found = capture(frame)
@@ -145,7 +147,7 @@ def _made_of(cells: NDArray[np.int64] | None, counts: NDArray[np.int64] | None) 
 
 def _simulated(path: Path, number: int, elevation: float, azimuth: float, seed: int) -> tuple[Frame, Mask]:
     """What a simulated camera sees of a stack of a file, and the stack's own silhouette."""
-    from stackgen.robot.capture_camera import Rig, simulated_frame
+    from stackgen.vision.cameras import Rig, simulated_frame
 
     content = read_stacks(path)
     if not 1 <= number <= len(content.stacks):

@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.table import Table
 
 from stackgen.api import judge
-from stackgen.commands import Command, Files
+from stackgen.commands.parsing import Command, Files
 from stackgen.commands.tables import add_entries, verdict_table
+from stackgen.io.stacks_file import Entry, read_stacks, write_stacks
+from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
-from stackgen.sim.verdict import SimulatorChecker
-from stackgen.stacks_file import Entry, read_stacks, write_stacks
 
 
 def main(
@@ -57,7 +57,7 @@ def main(
 
 def _explained(entries: Sequence[Entry], physics: Physics) -> tuple[tuple[Entry, ...], Table]:
     """The entries with margins, and what statics says of each beside the simulator's verdict."""
-    from stackgen.sim.equilibrium import EquilibriumChecker  # loads a solver that nothing else needs
+    from stackgen.sim.statics.checker import EquilibriumChecker  # loads a solver that nothing else needs
 
     checker = EquilibriumChecker(physics)
     table = Table("stack", "simulator", "statics", "margin", "push", "what cannot be held", box=None, pad_edge=False)

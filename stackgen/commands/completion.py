@@ -8,8 +8,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, get_args, get_origin
 
-from stackgen.cli import VERBS, usage
-from stackgen.commands import Command
+from stackgen.commands.cli import VERBS, usage
+from stackgen.commands.parsing import Command
 
 Shell = Literal["bash", "zsh", "fish"]
 

@@ -12,14 +12,14 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from stackgen.commands import Command, Files, epilog
-from stackgen.commands.progress import progress_bar
+from stackgen.commands.parsing import Command, Files, epilog
+from stackgen.commands.progress_bar import progress_bar
 from stackgen.data.card import write_card
 from stackgen.data.generation.executors import ExecutorName
 from stackgen.data.resplit import By, Resplit, resplit, split_table
 from stackgen.data.shards import SPLITS, Manifest
-from stackgen.files import write_atomically
-from stackgen.stack import StackgenError
+from stackgen.errors import StackgenError
+from stackgen.io.files import write_atomically
 
 TRAVELS = 64 * 2**20
 """Largest compact file that is easy to send along [byte]."""
@@ -31,7 +31,7 @@ def verify(folder: Path) -> int:
     Args:
         folder: Of the dataset.
     """
-    from stackgen.data.verification import verify as find_problems
+    from stackgen.data.inspection.verify import verify as find_problems
 
     manifest = Manifest.load(folder)
     with progress_bar("verifying", len(manifest.shards)) as (advance, _):
@@ -85,9 +85,9 @@ def info(folder: Path, out: Path | None = None, margins: int = 500, samples: int
         samples: Random stacks on the contact sheet; 0 for none.
         seed: Of both draws.
     """
-    from stackgen.data.figures import draw_facts, draw_samples, paragraphs
-    from stackgen.data.inspection import Contents, describe_margins, facts, sample_margins
-    from stackgen.render import save_image
+    from stackgen.data.inspection.contents import Contents, describe_margins, facts, sample_margins
+    from stackgen.data.inspection.plots import draw_facts, draw_samples, paragraphs
+    from stackgen.viz.render import save_image
 
     if margins < 0 or samples < 0:
         raise StackgenError("dataset info: margins and samples must be at least 0")
@@ -159,7 +159,7 @@ def export(folder: Path, out: Path) -> None:
         folder: Of the dataset.
         out: File to write, ending in .npz; `--data.path` takes it.
     """
-    from stackgen.data.arrays import load_dataset, save_npz
+    from stackgen.data.loading.arrays import load_dataset, save_npz
 
     splits, facts = load_dataset(folder)
     save_npz(out, splits, facts)
@@ -176,8 +176,8 @@ def _testset() -> Path:
 
 def _statics(manifest: Manifest) -> Any:
     """Statics with the friction that the dataset was made with."""
-    from stackgen.sim.equilibrium import EquilibriumChecker  # loads a solver that nothing else needs
     from stackgen.sim.physics import Physics
+    from stackgen.sim.statics.checker import EquilibriumChecker  # loads a solver that nothing else needs
 
     friction = manifest.physics.get("friction", Physics().friction)
     return EquilibriumChecker(Physics(friction=float(friction)))
@@ -185,7 +185,7 @@ def _statics(manifest: Manifest) -> Any:
 
 def _print_facts(found: Mapping[str, Any]) -> None:
     """What `dataset info` found, for the terminal."""
-    from stackgen.data.figures import duplicate_words, margin_words, nearness_words
+    from stackgen.data.inspection.plots import duplicate_words, margin_words, nearness_words
 
     console = Console()
     console.print(f"[bold]{escape(found['name'])}[/]: {found['stacks']:,} stacks")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from stackgen.commands import Command, Files
-from stackgen.runs import resolve_weights
+from stackgen.commands.parsing import Command, Files
+from stackgen.models.weights import resolve_weights
 
 
 def main(checkpoint: Path, out: Path, half: bool = False) -> None:
@@ -17,7 +17,7 @@ def main(checkpoint: Path, out: Path, half: bool = False) -> None:
         out: File to write, ending in .safetensors; the card gets the same name and .json.
         half: Store matrices as 16-bit floats: half the size.
     """
-    from stackgen.weights import export_checkpoint
+    from stackgen.models.weights import export_checkpoint
 
     export_checkpoint(Path(resolve_weights(checkpoint)), out, half=half)
     print(f"wrote {out}\nwrote {out.with_suffix('.json')}")

@@ -6,12 +6,12 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from stackgen.commands import Command
-from stackgen.commands.progress import progress_bar
+from stackgen.commands.parsing import Command
+from stackgen.commands.progress_bar import progress_bar
 from stackgen.data.generation.executors import ExecutorName, make_executor
 from stackgen.data.generation.generate import GenerateSettings, generate, generate_range
 from stackgen.data.shards import SPLITS
-from stackgen.stack import StackgenError
+from stackgen.errors import StackgenError
 
 
 def main(

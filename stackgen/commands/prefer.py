@@ -12,9 +12,9 @@ import numpy as np
 from rich.console import Console
 
 from stackgen.api import Trained
-from stackgen.commands import Command
-from stackgen.commands.progress import progress_bar
-from stackgen.stack import StackgenError
+from stackgen.commands.parsing import Command
+from stackgen.commands.progress_bar import progress_bar
+from stackgen.errors import StackgenError
 
 
 def main(
@@ -39,12 +39,11 @@ def main(
         iou: A success stands, and its settled silhouette matches at least this well.
         workers: Processes that simulate; by default one per core.
     """
-    from stackgen.data.arrays import load_dataset
+    from stackgen.data.loading.arrays import load_dataset
     from stackgen.data.preferences import prefer
-    from stackgen.evaluation import ParallelChecker
-    from stackgen.runs import resolve_weights
-    from stackgen.sim.verdict import SimulatorChecker
-    from stackgen.weights import load_sampler
+    from stackgen.evaluation.protocol import ParallelChecker
+    from stackgen.models.weights import load_sampler, resolve_weights
+    from stackgen.sim.checkers import SimulatorChecker
 
     if scenes < 1 or num_samples < 1:
         raise StackgenError("prefer: --scenes and --num_samples must be at least 1")

@@ -14,26 +14,27 @@ from typing import Any
 
 from rich.console import Console
 
-from stackgen.commands import Command
-from stackgen.commands.plan import Plan, ReportSettings, machine, make_plan
-from stackgen.commands.progress import progress_bar
+from stackgen.commands.parsing import Command
+from stackgen.commands.progress_bar import progress_bar
 from stackgen.data.shards import manifest_sha256
-from stackgen.evaluation import ParallelChecker, load_scenes, physics_of
-from stackgen.files import write_atomically
-from stackgen.geometry import Grid
+from stackgen.errors import StackgenError
+from stackgen.evaluation.protocol import ParallelChecker, load_scenes, physics_of
+from stackgen.evaluation.report.charts import draw_charts
+from stackgen.evaluation.report.collect import Asked, Store, Task, answer, write_record
+from stackgen.evaluation.report.figures import Result, results_of
+from stackgen.evaluation.report.known import Ceiling, Unseen, read_ceiling, read_unseen
+from stackgen.evaluation.report.plan import Plan, ReportSettings, machine, make_plan
+from stackgen.evaluation.report.rows import LIST_NAMES, Line, Row, check_rows, run_seconds, trainings
+from stackgen.evaluation.report.sheets import draw_sheets
+from stackgen.evaluation.report.tables import World, terminal_table, to_csv, to_json, to_markdown
+from stackgen.evaluation.results import Evaluation
+from stackgen.io.files import write_atomically
+from stackgen.io.provenance import code_version
 from stackgen.protocols import StabilityChecker
-from stackgen.reporting.charts import draw_charts
-from stackgen.reporting.collect import Asked, Store, Task, answer, write_record
-from stackgen.reporting.figures import Result, results_of
-from stackgen.reporting.known import Ceiling, Unseen, read_ceiling, read_unseen
-from stackgen.reporting.rows import LIST_NAMES, Line, Row, check_rows, run_seconds, trainings
-from stackgen.reporting.sheets import draw_sheets
-from stackgen.reporting.tables import World, terminal_table, to_csv, to_json, to_markdown
-from stackgen.results import Evaluation
-from stackgen.runs import RUNS, code_version
+from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
-from stackgen.sim.verdict import SimulatorChecker
-from stackgen.stack import Catalogue, StackgenError
+from stackgen.training.runs import RUNS
+from stackgen.world import Catalogue, Grid
 
 RESULTS = Path("docs/results")
 CACHE = RUNS / ".report"

@@ -16,18 +16,19 @@ from rich.console import Console
 from rich.progress import Progress
 
 from stackgen.api import DEFAULT, load
-from stackgen.commands import Command, Files
+from stackgen.commands.parsing import Command, Files
 from stackgen.commands.tables import add_entries, verdict_table
-from stackgen.export import write_glb
-from stackgen.files import require_folder
-from stackgen.models.sampler_config import SamplerConfig
+from stackgen.errors import StackgenError
+from stackgen.io.files import require_folder
+from stackgen.io.stacks_file import StacksFile, write_stacks
+from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.protocols import Judge
-from stackgen.render import contact_sheet, save_image
-from stackgen.stack import StackgenError, format_block_list
-from stackgen.stacks_file import StacksFile, write_stacks
+from stackgen.stack import format_block_list
+from stackgen.viz.export import write_glb
+from stackgen.viz.render import contact_sheet, save_image
 
 if TYPE_CHECKING:
-    from stackgen.verification import Budget
+    from stackgen.sampling.verified import Budget
 
 
 def main(
@@ -113,7 +114,7 @@ def _budget(verify: Judge | None, budget: str | None) -> Budget | None:
         return None
     if verify is None:
         raise StackgenError("--budget is what --verify may spend: give both, or neither")
-    from stackgen.verification import Budget
+    from stackgen.sampling.verified import Budget
 
     return Budget.parse(budget)
 

@@ -6,10 +6,10 @@ import webbrowser
 from collections.abc import Sequence
 from pathlib import Path
 
-from stackgen.commands import Command, Files
-from stackgen.export import write_html
-from stackgen.render import contact_sheet, save_image
-from stackgen.stacks_file import read_stacks
+from stackgen.commands.parsing import Command, Files
+from stackgen.io.stacks_file import read_stacks
+from stackgen.viz.export import write_html
+from stackgen.viz.render import contact_sheet, save_image
 
 
 def main(file: Path, out: Path | None = None, open: bool = False) -> None:

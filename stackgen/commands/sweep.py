@@ -8,11 +8,11 @@ from pathlib import Path
 
 from rich.console import Console
 
-from stackgen.commands import Command
-from stackgen.commands.progress import progress_bar
-from stackgen.runs import RUNS
-from stackgen.stack import StackgenError
-from stackgen.sweeps.file import Sweep
+from stackgen.commands.parsing import Command
+from stackgen.commands.progress_bar import progress_bar
+from stackgen.errors import StackgenError
+from stackgen.training.runs import RUNS
+from stackgen.training.sweeps.file import Sweep
 
 
 def main(sweep: Sweep, out: Path | None = None, parallel: int = 1, seed: int = 0, export_wandb: bool = False) -> None:
@@ -32,8 +32,8 @@ def main(sweep: Sweep, out: Path | None = None, parallel: int = 1, seed: int = 0
         return
     if parallel < 1:
         raise StackgenError(f"--parallel must be at least 1, got {parallel}")
-    from stackgen.sweeps.coordinator import JOURNAL, run_sweep, trials_wanted
-    from stackgen.sweeps.findings import leaderboard_table, ranking, write_findings
+    from stackgen.training.sweeps.coordinator import JOURNAL, run_sweep, trials_wanted
+    from stackgen.training.sweeps.findings import leaderboard_table, ranking, write_findings
 
     folder = out or RUNS / "sweeps" / sweep.name
     with progress_bar(sweep.name, trials_wanted(sweep)) as (advance, tell):

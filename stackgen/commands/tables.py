@@ -7,9 +7,9 @@ from collections.abc import Iterable
 import numpy as np
 from rich.table import Table
 
+from stackgen.io.stacks_file import Entry
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
-from stackgen.stacks_file import Entry
 
 
 def verdict_table(source: str) -> Table:

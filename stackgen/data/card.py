@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from stackgen.data.shards import FORMAT, SPLITS, Manifest
-from stackgen.files import write_atomically
+from stackgen.io.files import write_atomically
 
 CARD = "README.md"
 MARK = "<!-- Dataset card, written by stackgen: what is changed here by hand is lost when it is written again. -->"

@@ -2,7 +2,7 @@
 
 The whole of a paper-sized dataset is 150 MB as arrays, so it is held in memory (on the accelerator,
 where there is one) and batches are gathered there; streaming is for what does not fit.
-What a batch holds: :meth:`stackgen.data.arrays.StackTensors.batch`.
+What a batch holds: :meth:`stackgen.data.loading.arrays.StackTensors.batch`.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import torch
 from numpy.typing import NDArray
 
 from stackgen._lightning import pl
-from stackgen.data.arrays import Batch, StackArrays, load_dataset
-from stackgen.data.cached import CachedLoader
-from stackgen.data.decoding import Frame
-from stackgen.data.epochs import Epochs
-from stackgen.data.losses import Losses, read_decoded
+from stackgen.data.loading.arrays import Batch, StackArrays, load_dataset
+from stackgen.data.loading.cached import CachedLoader
+from stackgen.data.loading.decoding import Frame
+from stackgen.data.loading.epochs import Epochs
+from stackgen.data.loading.losses import Losses, read_decoded
 from stackgen.data.shards import Manifest, Split
 from stackgen.data.sources import is_folder, load_manifest, shards_of
-from stackgen.geometry import Grid
-from stackgen.stack import Catalogue, StackgenError
+from stackgen.errors import StackgenError
+from stackgen.world import Catalogue, Grid
 
 __all__ = ["TESTSET", "CachedLoader", "StackDataModule"]
 
@@ -172,7 +172,7 @@ class StackDataModule(pl.LightningDataModule):
         if self.is_cached("train"):
             self._training = CachedLoader(self.split("train"), self.batch_size, train=True, **options)
         else:
-            from stackgen.data.streaming import TrainingStream
+            from stackgen.data.loading.streaming import TrainingStream
 
             self._training = TrainingStream(self.path, self.batch_size, num_workers=self.num_workers, **options)
         self._training.in_hand = self._in_hand
@@ -214,7 +214,7 @@ class StackDataModule(pl.LightningDataModule):
     def _exact_loader(self, path: str, split: Split) -> Iterable[Batch]:
         if self.is_cached(split):
             return CachedLoader(self.split(split), self.eval_batch_size, train=False, device=self._device)
-        from stackgen.data.streaming import ExactStream
+        from stackgen.data.loading.streaming import ExactStream
 
         return ExactStream(path, split, self.eval_batch_size, num_workers=self.num_workers, device=self._device)
 

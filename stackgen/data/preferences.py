@@ -18,10 +18,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.data.arrays import PADDING, StackArrays
-from stackgen.geometry import PAPER_GRID, Grid, silhouette_iou
+from stackgen.data.loading.arrays import PADDING, StackArrays
+from stackgen.errors import StackgenError
+from stackgen.geometry import silhouette_iou
 from stackgen.protocols import StabilityChecker, StackSampler, Verdict, check_all
-from stackgen.stack import PAPER_CATALOGUE, Catalogue, StackgenError
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid
 
 _SCENES_AT_ONCE = 128
 

@@ -13,8 +13,8 @@ from typing import Any, Literal
 from stackgen.data.card import write_card
 from stackgen.data.generation.templates import Template
 from stackgen.data.shards import SPLITS, Manifest, Sample, Split, read_shard, split_of, write_shard
-from stackgen.geometry import Grid
-from stackgen.stack import Catalogue, StackgenError
+from stackgen.errors import StackgenError
+from stackgen.world import Catalogue, Grid
 
 By = Literal["template", "layout"]
 

@@ -22,9 +22,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.files import write_atomically
-from stackgen.geometry import Grid, Mask
-from stackgen.stack import Catalogue, Stack, StackgenError
+from stackgen.errors import StackgenError
+from stackgen.io.files import write_atomically
+from stackgen.stack import Stack
+from stackgen.world import Catalogue, Grid, Mask
 
 FORMAT = "stackgen.dataset/1"
 Split = Literal["train", "validation", "test"]

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from stackgen.data.shards import Manifest, Split
-from stackgen.stack import StackgenError
+from stackgen.errors import StackgenError
 
 PIPE = "pipe:"
 PLACE_OF_FILE = "{file}"

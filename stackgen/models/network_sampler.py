@@ -13,9 +13,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from stackgen.geometry import PAPER_GRID, Grid, Mask
-from stackgen.models.denoiser import POSE
-from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, Stack, StackgenError, shapes_of
+from stackgen.errors import StackgenError
+from stackgen.models.diffusion.denoiser import POSE
+from stackgen.stack import Stack, shapes_of
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
 
 Draw = Callable[[Tensor, Tensor, Tensor, torch.Generator], Tensor]
 """Silhouettes (B, H, W), shapes (B * n, N) and their mask, to poses (B * n, N, 6) [cell, rad]."""

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.robot.motion import Motion
+from stackgen.robot.planning.motion import Motion
 
 Floats = NDArray[np.float64]
 

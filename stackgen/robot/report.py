@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stackgen.io.stacks_file import Entry, StacksFile, to_json
 from stackgen.stack import Stack
-from stackgen.stacks_file import Entry, StacksFile, to_json
 
 Floats = NDArray[np.float64]
 

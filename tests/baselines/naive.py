@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.baselines.brute_force import REACH, BruteForce
-from stackgen.geometry import Mask, silhouette
+from stackgen.geometry import silhouette
 from stackgen.stack import Stack, shapes_of
+from stackgen.world import Mask
 
 
 def naive_search(method: BruteForce, target: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from stackgen.baselines.brute_force import BruteForce
-from stackgen.data.arrays import load_dataset
 from stackgen.data.datamodule import TESTSET
-from stackgen.evaluation import Scene, scenes_of
+from stackgen.data.loading.arrays import load_dataset
+from stackgen.errors import StackgenError
+from stackgen.evaluation.protocol import Scene, scenes_of
 from stackgen.geometry import iou, silhouette
-from stackgen.stack import Stack, StackgenError
+from stackgen.stack import Stack
 from tests.baselines.naive import naive_search
 
 

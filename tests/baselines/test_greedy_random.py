@@ -11,9 +11,11 @@ from hypothesis import strategies as st
 
 from stackgen.baselines.greedy_random import GreedyRandom, layer_runs
 from stackgen.baselines.swap import swap, swaps
-from stackgen.geometry import PAPER_GRID, silhouette, silhouette_iou
-from stackgen.metrics import layout
-from stackgen.stack import Stack, StackgenError, parse_block_list
+from stackgen.errors import StackgenError
+from stackgen.geometry import silhouette, silhouette_iou
+from stackgen.sampling.feasible import layout
+from stackgen.stack import Stack, parse_block_list
+from stackgen.world import PAPER_GRID
 
 CUBE, RECTANGLE, LONG, TRIANGLE = range(4)
 Row = list[tuple[int, float]]

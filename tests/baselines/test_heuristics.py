@@ -11,13 +11,14 @@ import yaml
 
 import stackgen
 from stackgen.baselines import HEURISTICS
-from stackgen.commands.protocol import WeightsUnderTest
+from stackgen.commands.test import WeightsUnderTest
 from stackgen.data.datamodule import TESTSET
-from stackgen.evaluation import load_scenes
-from stackgen.geometry import Mask
-from stackgen.stack import Stack, StackgenError
-from stackgen.stacks_file import read_stacks
-from stackgen.weights import load_sampler
+from stackgen.errors import StackgenError
+from stackgen.evaluation.protocol import load_scenes
+from stackgen.io.stacks_file import read_stacks
+from stackgen.models.weights import load_sampler
+from stackgen.stack import Stack
+from stackgen.world import Mask
 from tests.conftest import Cli, TinyWeights
 
 CONFIGS = Path(__file__).parents[2] / "configs" / "baselines"

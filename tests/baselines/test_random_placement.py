@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.stats import kstest
 
 from stackgen.baselines.random_placement import RandomPlacement
-from stackgen.geometry import Grid
-from stackgen.stack import PAPER_CATALOGUE, Catalogue, Shape, Stack
+from stackgen.stack import Stack
+from stackgen.world import PAPER_CATALOGUE, Catalogue, Grid, Shape
 
 PICTURE = np.zeros((64, 64), dtype=bool)
 

@@ -11,7 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from stackgen.baselines.regression import PoseRegression
+from stackgen.baselines.tran_reg import PoseRegression
+from stackgen.baselines.tran_vae import PoseVAE, VAEConfig
 from stackgen.baselines.transformer import (
     BlockTokens,
     PoseNetwork,
@@ -21,9 +22,8 @@ from stackgen.baselines.transformer import (
     best_match,
     shuffled,
 )
-from stackgen.baselines.vae import PoseVAE, VAEConfig
-from stackgen.models.denoiser import Denoiser, DenoiserConfig, raster_order, sinusoids
-from stackgen.stack import StackgenError
+from stackgen.errors import StackgenError
+from stackgen.models.diffusion.denoiser import Denoiser, DenoiserConfig, raster_order, sinusoids
 
 PAPER = DenoiserConfig(width=16, layers=3, heads=2, feedforward=24)
 CROSS = replace(PAPER, conditioning="cross", memory_layers=1, mask_padding=True, ordered=True)

@@ -13,20 +13,19 @@ import torch
 import yaml
 
 from stackgen._lightning import pl
-from stackgen.baselines.regression import PoseRegression
-from stackgen.baselines.tran_reg import TranReg
-from stackgen.baselines.tran_vae import TranVAE
+from stackgen.baselines.tran_reg import PoseRegression
+from stackgen.baselines.tran_reg_module import TranReg
+from stackgen.baselines.tran_vae import PoseVAE, VAEConfig
+from stackgen.baselines.tran_vae_module import TranVAE
 from stackgen.baselines.transformer import RegressionConfig
-from stackgen.baselines.vae import PoseVAE, VAEConfig
-from stackgen.callbacks import EMA
-from stackgen.data.arrays import StackArrays
 from stackgen.data.datamodule import StackDataModule
-from stackgen.models.denoiser import Denoiser, DenoiserConfig
+from stackgen.data.loading.arrays import StackArrays
+from stackgen.errors import StackgenError
+from stackgen.models.diffusion.denoiser import Denoiser, DenoiserConfig
 from stackgen.models.optimization import OptimizerConfig
+from stackgen.models.weights import export_checkpoint, last_checkpoint, load_predictor, load_sampler
 from stackgen.protocols import StackSampler
-from stackgen.runs import last_checkpoint
-from stackgen.stack import StackgenError
-from stackgen.weights import export_checkpoint, load_predictor, load_sampler
+from stackgen.training.callbacks import EMA
 from tests.conftest import Cli, TinyWeights
 from tests.models.conftest import TINY, TINY_CROSS, trainer_for
 
@@ -151,7 +150,7 @@ def test_checkpoint_export_and_module_sample_alike(
 
 @pytest.mark.parametrize("method", METHODS)
 def test_a_card_that_does_not_fit_is_refused(method: str, tmp_path: Path) -> None:
-    from stackgen.weights import write_weights
+    from stackgen.models.weights import write_weights
 
     module = module_for(method)
     module.build()

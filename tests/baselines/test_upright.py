@@ -7,8 +7,9 @@ import pytest
 
 from stackgen.baselines.heuristic import section
 from stackgen.baselines.upright import running_sums, span
-from stackgen.geometry import PAPER_GRID, Grid, silhouette
-from stackgen.stack import PAPER_CATALOGUE, Stack
+from stackgen.geometry import silhouette
+from stackgen.stack import Stack
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Grid
 
 GRIDS = [PAPER_GRID, Grid(width=6, height=3, pixels_per_cell=9.3, ground_margin=2)]
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stackgen.data.arrays import StackArrays, load_dataset
 from stackgen.data.generation.templates import draw_template, realize
+from stackgen.data.loading.arrays import StackArrays, load_dataset
 from stackgen.data.shards import Manifest, Sample, write_shard
-from stackgen.geometry import PAPER_GRID, silhouette
-from stackgen.stack import PAPER_CATALOGUE
+from stackgen.geometry import silhouette
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID
 
 SHARDS = {"train-000000.tar": 41, "train-000001.tar": 30, "validation-000002.tar": 23, "test-000003.tar": 7}
 

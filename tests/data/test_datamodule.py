@@ -16,12 +16,12 @@ import pytest
 import torch
 
 from stackgen._lightning import pl
-from stackgen.data.arrays import StackArrays, save_npz
-from stackgen.data.cached import CachedLoader
 from stackgen.data.datamodule import StackDataModule
-from stackgen.data.decoding import Frame
+from stackgen.data.loading.arrays import StackArrays, save_npz
+from stackgen.data.loading.cached import CachedLoader
+from stackgen.data.loading.decoding import Frame
 from stackgen.data.shards import Manifest
-from stackgen.stack import StackgenError
+from stackgen.errors import StackgenError
 
 
 def _place(rank: int, world: int = 3) -> tuple[int, int]:

@@ -11,10 +11,10 @@ import pytest
 
 from stackgen.data import resplit as module
 from stackgen.data.generation.templates import Template
+from stackgen.data.inspection.verify import verify
 from stackgen.data.resplit import By, Resplit, resplit, split_table
 from stackgen.data.shards import SPLITS, Manifest, Sample, write_shard
-from stackgen.data.verification import verify
-from stackgen.stack import StackgenError
+from stackgen.errors import StackgenError
 from tests.conftest import Cli
 
 

@@ -13,7 +13,8 @@ import pytest
 import webdataset
 
 from stackgen.data.shards import FORMAT, SPLITS, Manifest, Sample, decode_sample, read_shard, write_shard
-from stackgen.stack import PAPER_CATALOGUE, StackgenError
+from stackgen.errors import StackgenError
+from stackgen.world import PAPER_CATALOGUE
 
 
 def assert_same(a: Sample, b: Sample) -> None:

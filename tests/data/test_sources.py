@@ -16,12 +16,12 @@ import numpy as np
 import pytest
 
 from stackgen.data import sources
-from stackgen.data.arrays import StackArrays, load_dataset, save_npz
 from stackgen.data.datamodule import StackDataModule
+from stackgen.data.loading.arrays import StackArrays, load_dataset, save_npz
+from stackgen.data.loading.streaming import TrainingStream
 from stackgen.data.shards import Manifest
 from stackgen.data.sources import read_bytes
-from stackgen.data.streaming import TrainingStream
-from stackgen.stack import StackgenError
+from stackgen.errors import StackgenError
 
 
 @pytest.fixture(autouse=True)

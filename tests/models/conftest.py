@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from stackgen._lightning import pl
-from stackgen.data.arrays import StackArrays, save_npz
 from stackgen.data.generation.templates import draw_template, realize
+from stackgen.data.loading.arrays import StackArrays, save_npz
 from stackgen.data.shards import Manifest, Sample
-from stackgen.geometry import PAPER_GRID, silhouette
-from stackgen.models.denoiser import DenoiserConfig
-from stackgen.stack import PAPER_CATALOGUE
+from stackgen.geometry import silhouette
+from stackgen.models.diffusion.denoiser import DenoiserConfig
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID
 
 TINY = DenoiserConfig(width=16, layers=1, heads=2, feedforward=32)
 TINY_CROSS = DenoiserConfig(

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stackgen.geometry import Mask
-from stackgen.models.diffusion import DiffusionConfig, DiffusionSampler, PoseDiffusion
+from stackgen.errors import StackgenError
+from stackgen.models.diffusion.network import DiffusionConfig, DiffusionSampler, PoseDiffusion
+from stackgen.models.diffusion.schedules import ScheduleConfig
 from stackgen.models.network_sampler import pad_shapes
-from stackgen.models.schedules import ScheduleConfig
-from stackgen.stack import StackgenError
+from stackgen.world import Mask
 from tests.models.conftest import TINY
 
 

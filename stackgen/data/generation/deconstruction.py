@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.sim.certificate import Certificate, Outcome, PlaneStatics
-from stackgen.sim.verdict import AcceptLimits, accept
-from stackgen.sim.world import Simulator
+from stackgen.sim.checkers import AcceptLimits, accept
+from stackgen.sim.simulator import Simulator
+from stackgen.sim.statics.plane import Certificate, Outcome, PlaneStatics
 from stackgen.stack import Stack
 
 NEVER = Certificate(enabled=False)

@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Literal, Protocol, TypeVar
 
-from stackgen.stack import StackgenError
+from stackgen.errors import StackgenError
 
 ExecutorName = Literal["local", "ray"]
 T = TypeVar("T")

@@ -25,13 +25,13 @@ from stackgen.data.generation.pictures import Pictures
 from stackgen.data.generation.templates import Template, TemplateSettings, draw_template, realize
 from stackgen.data.generation.workshop import Entry, Shard, Workshop, claim, disk_may_be_full, finished, sweep
 from stackgen.data.shards import PARTS, Manifest, Sample, Split, encode_shard, read_shard, shard_entry, split_of
-from stackgen.files import write_atomically
-from stackgen.geometry import PAPER_GRID, Grid
-from stackgen.sim.certificate import Certificate
+from stackgen.errors import StackgenError
+from stackgen.io.files import write_atomically
+from stackgen.sim.checkers import AcceptLimits
 from stackgen.sim.physics import Physics
-from stackgen.sim.verdict import AcceptLimits
-from stackgen.sim.world import Simulator
-from stackgen.stack import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue, StackgenError
+from stackgen.sim.simulator import Simulator
+from stackgen.sim.statics.plane import Certificate
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid
 
 TESTSET = Path(__file__).resolve().parents[2] / "assets" / "testset-v1"
 REVISION = 1

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from stackgen.geometry import Grid, Mask, silhouette
+from stackgen.geometry import silhouette
 from stackgen.stack import Stack
+from stackgen.world import Grid, Mask
 
 
 class Pictures:

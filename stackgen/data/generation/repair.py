@@ -14,9 +14,9 @@ from stackgen.data.generation.executors import Executor, make_executor
 from stackgen.data.generation.generate import REVISION, GenerateSettings, ShardTask, draw, make_shards
 from stackgen.data.generation.workshop import Entry, Shard, Workshop, disk_may_be_full
 from stackgen.data.shards import PARTS, Manifest, encode_shard, is_whole, iterate_shard, shard_entry, shard_number
-from stackgen.files import write_atomically
+from stackgen.errors import StackgenError
+from stackgen.io.files import write_atomically
 from stackgen.sim.physics import engine_version
-from stackgen.stack import StackgenError
 
 
 @dataclass(frozen=True)

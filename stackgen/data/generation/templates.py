@@ -8,8 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from stackgen.geometry import PAPER_GRID, Grid
-from stackgen.stack import PAPER_CATALOGUE, Catalogue, Shape, Stack, StackgenError
+from stackgen.errors import StackgenError
+from stackgen.stack import Stack
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Shape
 
 _EPSILON = 1e-6  # [cell]
 

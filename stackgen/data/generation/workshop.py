@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from stackgen.data.shards import PARTS, PROGRESS, Manifest, encode_shard, is_whole, read_shard, shard_entry
-from stackgen.files import write_atomically
-from stackgen.stack import StackgenError
+from stackgen.errors import StackgenError
+from stackgen.io.files import write_atomically
 
 Entry = dict[str, Any]
 

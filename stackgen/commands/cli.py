@@ -1,0 +1,166 @@
+"""The one executable: a table of verbs, and the one place where an error becomes a line.
+
+Standard library only, so that `stackgen --help` answers at once; a verb's module is imported when it runs.
+"""
+
+from __future__ import annotations
+
+import difflib
+import errno
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import NamedTuple
+
+BAD_INPUT, BUG, INTERRUPTED = 2, 70, 130
+
+
+class Verb(NamedTuple):
+    """A row of the table.
+
+    Args:
+        module: With a `run(argv) -> int | None`.
+        help: One line.
+    """
+
+    module: str
+    help: str
+
+
+VERBS: dict[str, Verb] = {
+    "sample": Verb("stackgen.commands.sample", "turn silhouettes into stacks that stand"),
+    "check": Verb("stackgen.commands.check", "judge the structures of a file: which stand, which fall"),
+    "show": Verb("stackgen.commands.show", "draw the structures of a file, as a picture and in 3-D"),
+    "capture": Verb("stackgen.commands.capture", "find the silhouette in a depth frame or a photo of a sketch"),
+    "build": Verb("stackgen.commands.build", "build a structure with a UR5 and parallel jaws, simulated or real"),
+    "generate": Verb("stackgen.commands.generate", "make a dataset by deconstruction"),
+    "dataset": Verb("stackgen.commands.dataset", "verify, repair, describe, split or export a dataset"),
+    "fit": Verb("stackgen.commands.fit", "train a model"),
+    "validate": Verb("stackgen.commands.fit", "validate a model on the validation split"),
+    "test": Verb("stackgen.commands.fit", "run the paper's protocol on the frozen test set"),
+    "predict": Verb("stackgen.commands.fit", "sample stacks for a split of a dataset"),
+    "sweep": Verb("stackgen.commands.sweep", "try many settings of a training, locally or at W&B"),
+    "prefer": Verb("stackgen.commands.prefer", "pair failures of a model with stacks that stand, to fine-tune it"),
+    "report": Verb("stackgen.commands.report", "make the paper's table with every row, and its charts"),
+    "export": Verb("stackgen.commands.export", "turn a training checkpoint into weights with a card"),
+    "completion": Verb("stackgen.commands.completion", "print a script that completes this command line in a shell"),
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command line; never raises, so that every error has one form.
+
+    Args:
+        argv: Without the program's name; those of the process by default.
+
+    Returns:
+        The exit code: 0, what the verb answers (`check`: 1 if a stack falls), 2 for bad input,
+        130 when interrupted, 70 for a bug of ours (with its traceback).
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments[:1] == ["help"] and len(arguments) > 1:
+        arguments = [*arguments[1:], "--help"]
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        return _talk(usage())
+    if arguments[0] in ("-V", "--version", "version"):
+        return _talk(f"stackgen {_version()}")
+    verb, rest = arguments[0], arguments[1:]
+    if verb not in VERBS:
+        return _complain("", _unknown(verb), BAD_INPUT)
+    try:
+        return _flushed(importlib.import_module(VERBS[verb].module).run(verb, rest))
+    except SystemExit as exit_:  # argparse's --help and the like
+        return exit_.code if isinstance(exit_.code, int) else 0 if exit_.code is None else BAD_INPUT
+    except KeyboardInterrupt as interrupt:
+        _debug()
+        return _complain(verb, f"interrupted; {interrupt or 'no half-written file is left behind'}", INTERRUPTED)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python complains once more at exit
+        return 0
+    except Exception as error:  # noqa: BLE001 - the one place that turns errors into lines
+        line = explain(error)
+        if line is None:
+            traceback.print_exc()
+            return _complain(verb, "this is a bug of stackgen; please report the lines above", BUG)
+        _debug()
+        return _complain(verb, line, BAD_INPUT)
+
+
+def explain(error: BaseException) -> str | None:
+    """One line for an error that a user can mend, None for a bug."""
+    kinds = {kind.__name__ for kind in type(error).__mro__}
+    text = " ".join(str(error).split())
+    if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+        return f"disk full while writing {error.filename or 'a file'}: free some space and run the command again"
+    if isinstance(error, OSError) and error.errno is not None:
+        return f"{error.strerror or text}: {error.filename}" if error.filename else text
+    if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("stackgen"):
+        return f"the package {error.name!r} is missing here: pip install {error.name}"
+    # By name: the command line does not import the packages that define them.
+    if kinds & {"StackgenError", "ArgumentError", "MisconfigurationException"}:
+        return text
+    # jsonargparse wraps what goes wrong in a constructor.
+    return explain(error.__cause__) if error.__cause__ is not None else None
+
+
+def usage() -> str:
+    """The table, for `stackgen --help`."""
+    width = max(map(len, VERBS))
+    rows = [f"  {name:<{width}}  {verb.help}" for name, verb in VERBS.items()]
+    return "\n".join(
+        [
+            "usage: stackgen VERB ... | stackgen VERB --help | stackgen --version",
+            "",
+            "Stable block structures from silhouettes.",
+            "",
+            *rows,
+            "",
+            "example: stackgen sample examples/silhouettes/arch.png --num_samples 3 --out out/arch",
+        ]
+    )
+
+
+def _unknown(verb: str) -> str:
+    near = difflib.get_close_matches(verb, VERBS, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"there are {', '.join(VERBS)}"
+    return f"unknown verb {verb!r}: {hint}"
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("stackgen")
+    except PackageNotFoundError:
+        return "(not installed)"
+
+
+def _talk(text: str) -> int:
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
+def _flushed(code: int | None) -> int:
+    """Flush here, where a broken pipe is still caught."""
+    sys.stdout.flush()
+    return code or 0
+
+
+def _complain(verb: str, message: str, code: int) -> int:
+    print(f"stackgen{' ' if verb else ''}{verb}: {message}", file=sys.stderr)
+    return code
+
+
+def _debug() -> None:
+    """The traceback behind a line, for who asks for it with STACKGEN_DEBUG=1."""
+    if os.environ.get("STACKGEN_DEBUG"):
+        traceback.print_exc()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

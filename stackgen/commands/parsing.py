@@ -1,0 +1,221 @@
+"""The verbs of the command line, and how their typed functions become parsers."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import yaml
+from jsonargparse import ArgumentError, ArgumentParser, DefaultHelpFormatter, Namespace, set_parsing_settings
+from jsonargparse.typing import register_type
+from omegaconf.errors import OmegaConfBaseException
+
+from stackgen.commands.hints import did_you_mean
+from stackgen.errors import StackgenError
+from stackgen.world import Catalogue
+
+
+def _catalogue(value: Any) -> Catalogue:
+    """A catalogue from what stands in YAML, or from what jsonargparse makes of a default."""
+    if isinstance(value, Mapping) and "init_args" in value:
+        return Catalogue(value["init_args"]["shapes"])
+    return Catalogue.from_config(value)
+
+
+# In YAML a catalogue is a list of shapes, and no group of options.
+register_type(Catalogue, Catalogue.to_json, _catalogue)
+set_parsing_settings(subclasses_enabled=[Catalogue])
+
+CONFIG_FLAGS = ("-c", "--config")
+CONFIG_HELP = "YAML file with these options, or with a section named like the verb that holds them."
+
+
+class HelpFormatter(DefaultHelpFormatter, argparse.RawDescriptionHelpFormatter):
+    """Leaves the line breaks of the example under a help alone; names shapes and types as a person would."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        if isinstance(action.default, Mapping) and "shapes" in action.default.get("init_args", ()):
+            return f"{action.help} (default: {', '.join(_catalogue(action.default).names)})"
+        return super()._get_help_string(action)
+
+    def _expand_help(self, action: argparse.Action) -> str:
+        return re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", super()._expand_help(action))
+
+
+@dataclass(frozen=True)
+class Files:
+    """The argument that a verb takes without its name.
+
+    Args:
+        parameter: Of the verb's function.
+        metavar: What the help calls it.
+        help: What it is.
+        many: Any number of paths, at least one, instead of exactly one.
+        optional: One path or none.
+    """
+
+    parameter: str
+    metavar: str
+    help: str
+    many: bool = False
+    optional: bool = False
+
+
+@dataclass(frozen=True)
+class Command:
+    """A typed function as a verb: its parameters are the options, its docstring their help.
+
+    Args:
+        verb: Its name.
+        function: What it does; answers the exit code, or None for 0.
+        example: Command lines to show under the help.
+        files: The paths it takes, if any.
+        settings: A parameter that is a dataclass whose fields are options of their own, without a prefix.
+        flags: Boolean parameters that are switched on by naming them, and their help.
+        interpolation: Whether `${...}` in configuration files stands for another option's value.
+    """
+
+    verb: str
+    function: Callable[..., int | None]
+    example: str
+    files: Files | None = None
+    settings: tuple[str, type] | None = None
+    flags: Mapping[str, str] = field(default_factory=dict)
+    interpolation: bool = True
+
+    def parser(self) -> ArgumentParser:
+        """The parser; it raises its errors instead of printing them."""
+        parser = ArgumentParser(
+            prog=f"stackgen {self.verb}",
+            description=(self.function.__doc__ or "").partition("\n\n")[0].strip(),
+            epilog=epilog(self.example),
+            formatter_class=HelpFormatter,
+            exit_on_error=False,
+            allow_abbrev=False,
+            parser_mode="omegaconf+" if self.interpolation else "yaml",
+        )
+        parser.add_argument(*CONFIG_FLAGS, action="config", help=CONFIG_HELP)
+        if self.files:
+            nargs = "+" if self.files.many else "?" if self.files.optional else None
+            # A default of its own would take the place of what a configuration file says.
+            no_default: dict[str, Any] = {"default": argparse.SUPPRESS} if self.files.optional else {}
+            parser.add_argument(
+                self.files.parameter,
+                nargs=nargs,
+                type=Path,
+                metavar=self.files.metavar,
+                help=self.files.help,
+                **no_default,
+            )
+        if self.settings:
+            parser.add_class_arguments(self.settings[1], sub_configs=True, as_group=False)
+        for name, text in self.flags.items():
+            parser.add_argument(f"--{name}", action="store_true", help=text)
+        special: set[str | int] = set(self.flags)
+        if self.files:
+            special.add(self.files.parameter)
+        if self.settings:
+            special.add(self.settings[0])
+        parser.add_function_arguments(
+            self.function, skip=special, as_group=False, as_positional=False, sub_configs=True
+        )
+        return parser
+
+    def run(self, argv: Sequence[str]) -> int | None:
+        """Parse what follows the verb and call the function."""
+        parser = self.parser()
+        values = parse(parser, self.verb, own_sections(self.verb, argv))
+        values.pop("config", None)
+        options = vars(parser.instantiate(values))
+        if self.settings:
+            name, kind = self.settings
+            options[name] = kind(**{item.name: options.pop(item.name) for item in fields(kind)})
+        return self.function(**options)
+
+
+def epilog(example: str) -> str:
+    """Command lines as they stand under a help."""
+    return "\n".join(["example:", *(f"  {line.strip()}" for line in example.strip().splitlines())])
+
+
+def parse(parser: ArgumentParser, verb: str, argv: Sequence[str], own: ArgumentParser | None = None) -> Namespace:
+    """Parse, or say in one line what was wrong and where to look.
+
+    Args:
+        parser: Of the arguments.
+        verb: Whose they are.
+        argv: The arguments.
+        own: The parser that knows the verb's options, if the other one only knows verbs.
+
+    Raises:
+        StackgenError: On an unknown option or key, a missing or ill-typed value, a broken YAML file.
+    """
+    try:
+        return parser.parse_args(list(argv))
+    except (ArgumentError, OmegaConfBaseException) as error:
+        text = str(error).replace(f"required: {verb}.", "required: ")
+        raise StackgenError(
+            f"{_shorten(text)}{did_you_mean(own or parser, text)}; see `stackgen {verb} --help`"
+        ) from error
+
+
+def own_sections(verb: str, argv: Sequence[str]) -> list[str]:
+    """Replace each `--config FILE` that has a section named like the verb by the text of that section.
+
+    So one file can hold the options of several verbs that belong together.
+    """
+    arguments = list(argv)
+    for index, value in option_values(arguments, CONFIG_FLAGS):
+        section = _section(Path(value), verb)
+        if section is not None:
+            flag, equals, _ = arguments[index].partition("=")
+            arguments[index] = f"{flag}={section}" if equals and flag in CONFIG_FLAGS else section
+    return arguments
+
+
+def option_values(arguments: Sequence[str], flags: Sequence[str]) -> list[tuple[int, str]]:
+    """The values given to an option, with their places in the arguments.
+
+    >>> option_values(["a", "-c", "x.yaml", "--config=y.yaml"], ("-c", "--config"))
+    [(2, 'x.yaml'), (3, 'y.yaml')]
+    """
+    found = []
+    for index, argument in enumerate(arguments):
+        flag, equals, value = argument.partition("=")
+        if equals and flag in flags:
+            found.append((index, value))
+        elif index and arguments[index - 1] in flags:
+            found.append((index, argument))
+    return found
+
+
+def _section(file: Path, verb: str) -> str | None:
+    try:
+        content = yaml.safe_load(file.read_text()) if file.is_file() else None
+    except (yaml.YAMLError, UnicodeDecodeError):
+        return None  # the parser will say so
+    if isinstance(content, dict) and isinstance(content.get(verb), dict):
+        return yaml.safe_dump(content[verb], sort_keys=False)
+    return None
+
+
+_NOISE = re.compile(
+    r"(- )?(Does not validate against any of the Union|Subtypes:|Errors:|Given value|Expected a <class 'NoneType'>"
+    r"|Expected a path but|Subclass types expect|a class path|a dict with)"
+)
+
+
+def _shorten(message: str, limit: int = 300) -> str:
+    """The gist of jsonargparse's paragraphs, as one line.
+
+    >>> _shorten("Parser key 'data.mode':\\n  Errors:\\n  - Expected a float. Got value: q\\n  - Expected a path but q")
+    'data.mode: Expected a float. Got value: q'
+    """
+    lines = [line.strip() for line in message.splitlines() if line.strip() and not _NOISE.match(line.strip())]
+    text = " ".join(dict.fromkeys(line.removeprefix("- ") for line in lines))  # each member of a union says it
+    text = re.sub(r"""^Parser key ["'](.*?)["']""", r"\1", re.sub(r"<class '([\w.]+)'>", r"\1", text))
+    return text if len(text) <= limit else f"{text[:limit].rstrip()} ..."

@@ -1,0 +1,115 @@
+"""Which stacks of one set have a layout that another set holds too: what a network may have learnt by heart.
+
+Two notions of "the same", from coarse to fine. The *layout* is that of
+:func:`stackgen.sampling.feasible.layout`, by which the paper counts diversity: the shapes of each layer from left to right. The *design* adds the cell in which each
+block begins, as in the `layout` of a sample's metadata; what it leaves out is displacement and settling alone.
+
+Pure numpy, no simulator and no torch. Legend: M stacks, N blocks at most.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stackgen.data.generation.templates import cells_wide
+from stackgen.data.loading.decoding import PADDING
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid
+
+_EMPTY = -1
+
+
+class PaddedStacks(Protocol):
+    """What is read of :class:`stackgen.data.loading.arrays.StackArrays`."""
+
+    @property
+    def shapes(self) -> NDArray[np.uint8]:
+        """(M, N) indices into the catalogue, 255 after the last block."""
+        ...
+
+    @property
+    def poses(self) -> NDArray[np.float32]:
+        """(M, N, 6) [cell, rad]."""
+        ...
+
+
+def seen_layouts(
+    train: PaddedStacks,
+    test: PaddedStacks,
+    *,
+    positions: bool = False,
+    mirror: bool = True,
+    grid: Grid = PAPER_GRID,
+    catalogue: Catalogue = PAPER_CATALOGUE,
+) -> NDArray[np.bool_]:
+    """(M,) for each stack of `test` whether `train` holds a stack of the same layout.
+
+    The defaults call a layout seen in case of doubt, so that what is called unseen is.
+
+    Args:
+        train: What was trained on.
+        test: What is asked about.
+        positions: Compare designs instead: also the cell in which each block begins.
+        mirror: What is the mirror image of a training stack counts as seen, as in training with `data.mirror`.
+        grid, catalogue: The world of both.
+
+    >>> from types import SimpleNamespace
+    >>> def pair(left: int, right: int) -> SimpleNamespace:
+    ...     poses = np.array([[[-1, 0, 0.5, 0, 0, 0], [1, 0, 0.5, 0, 0, 0]]], np.float32)
+    ...     return SimpleNamespace(shapes=np.array([[left, right]], np.uint8), poses=poses)
+    >>> seen_layouts(pair(0, 1), pair(1, 0)).tolist(), seen_layouts(pair(0, 1), pair(1, 0), mirror=False).tolist()
+    ([True], [False])
+    """
+
+    def codes(stacks: PaddedStacks, mirrored: bool = False) -> NDArray[np.int32]:
+        return layout_codes(stacks, positions=positions, mirrored=mirrored, grid=grid, catalogue=catalogue)
+
+    known = np.concatenate([codes(train), codes(train, mirrored=True)]) if mirror else codes(train)
+    columns = max(train.shapes.shape[1], test.shapes.shape[1])
+    return np.isin(as_scalars(codes(test), columns), as_scalars(known, columns))
+
+
+def layout_codes(
+    stacks: PaddedStacks,
+    *,
+    positions: bool = False,
+    mirrored: bool = False,
+    grid: Grid = PAPER_GRID,
+    catalogue: Catalogue = PAPER_CATALOGUE,
+) -> NDArray[np.int32]:
+    """(M, N) layouts as numbers: equal rows, equal layouts.
+
+    Args:
+        stacks: M of them.
+        positions: Add the cell in which each block begins.
+        mirrored: Of the mirror images.
+        grid, catalogue: Their world.
+    """
+    real = stacks.shapes != PADDING
+    shapes = np.where(real, stacks.shapes, 0).astype(np.int32)
+    x = -stacks.poses[..., 0] if mirrored else stacks.poses[..., 0]
+    layers = np.clip(np.floor(stacks.poses[..., 2]), 0, grid.height - 1).astype(np.int32)
+    codes = layers * 256 + shapes
+    if positions:
+        cells = np.array([cells_wide(shape) for shape in catalogue])
+        left = np.round(x - cells[shapes] / 2 + grid.width / 2)
+        codes = codes * 256 + np.clip(left, -128, 127).astype(np.int32) + 128
+    order = np.lexsort((x, np.where(real, layers, grid.height)), axis=-1)
+    return np.take_along_axis(np.where(real, codes, _EMPTY), order, axis=-1)
+
+
+def share_in_common(seen: NDArray[np.bool_]) -> str:
+    """How many of how many, in words.
+
+    >>> share_in_common(np.array([True, False, True, True]))
+    '3 of 4 (75.0 %)'
+    """
+    return f"{int(seen.sum())} of {len(seen)} ({100 * seen.mean() if len(seen) else 0:.1f} %)"
+
+
+def as_scalars(codes: NDArray[np.int32], columns: int) -> NDArray[np.void]:
+    """(M,) one value for each row of :func:`layout_codes`, padded to so many columns; to sort and compare."""
+    padded = np.pad(codes, ((0, 0), (0, columns - codes.shape[1])), constant_values=_EMPTY)
+    return np.ascontiguousarray(padded).view(np.dtype((np.void, padded.itemsize * columns))).ravel()

@@ -1,0 +1,139 @@
+"""Is a dataset what was written, to the last bit, and is every stack in it one?"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stackgen.data.loading.decoding import Frame, decode_shard
+from stackgen.data.shards import PARTS, PROGRESS, SPLITS, Manifest
+
+Fault = Literal["missing", "truncated", "altered", "unreadable", "wrong", "foreign"]
+_BLOCK = 512  # of a tar; a member's name is the beginning of one [byte]
+_END = 1024  # zero bytes at least at the end of a tar
+_RECORD = 10240  # a tar is padded to a multiple of it [byte]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something that is wrong with a dataset.
+
+    Args:
+        file: Its name.
+        fault: `missing`; `truncated`, cut off; `altered`, bytes changed; `unreadable`, a sample is not what the
+            format says; `wrong`, the manifest contradicts itself or the shards; `foreign`, no part of the dataset.
+        detail: More about it, in words.
+    """
+
+    file: str
+    fault: Fault
+    detail: str = ""
+
+    @property
+    def breaks_bytes(self) -> bool:
+        """Whether a shard is not as it was written: what a repair can mend."""
+        return self.fault in ("missing", "truncated", "altered")
+
+
+def verify(folder: Path, progress: Callable[[int], None] | None = None) -> list[Problem]:
+    """Compare every shard with its checksum and read every sample.
+
+    Args:
+        folder: Of the dataset.
+        progress: Called with the number of shards that have been looked at.
+
+    Returns:
+        All that is wrong; empty if nothing is.
+
+    Raises:
+        StackgenError: If there is no dataset.
+    """
+    manifest = Manifest.load(folder)
+    problems = _of_manifest(folder, manifest)
+    seen = _Seen({}, {})
+    for number, entry in enumerate(manifest.shards, 1):
+        problems += _of_shard(folder, manifest, entry, seen)
+        if progress:
+            progress(number)
+    return problems + _foreign(folder, manifest)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Where keys and templates were met so far: a key is unique, a template on one side only."""
+
+    keys: dict[bytes, str]
+    splits: dict[int, str]
+
+
+def _of_manifest(folder: Path, manifest: Manifest) -> list[Problem]:
+    problems = []
+    counts = json.loads((folder / "dataset.json").read_bytes()).get("counts")
+    if counts != {split: manifest.count(split) for split in SPLITS}:
+        problems.append(Problem("dataset.json", "wrong", "its counts are not the sums of its shards'"))
+    files = [entry["file"] for entry in manifest.shards]
+    twice = {file for file in files if files.count(file) > 1}
+    return problems + [Problem(file, "wrong", "dataset.json names it twice") for file in sorted(twice)]
+
+
+def _of_shard(folder: Path, manifest: Manifest, entry: dict[str, Any], seen: _Seen) -> list[Problem]:
+    name = entry["file"]
+    if Path(name).name != name:
+        return [Problem("dataset.json", "wrong", f"it names a file {name!r} outside of the folder")]
+    try:
+        content = (folder / name).read_bytes()
+    except FileNotFoundError:
+        return [Problem(name, "missing", f"{entry['samples']} stacks")]
+    except OSError as error:
+        return [Problem(name, "unreadable", error.strerror or str(error))]
+    decoded = decode_shard(content, Frame.of(manifest))
+    readable = len(decoded.positions)
+    if hashlib.sha256(content).hexdigest() != entry["sha256"]:
+        truncated = len(content) % _RECORD != 0 or any(content[-_END:])
+        still = f"{readable} of {entry['samples']} stacks can still be read, whether they are right or not"
+        return [Problem(name, "truncated" if truncated else "altered", still)]
+    problems = [Problem(name, "unreadable", f"sample {text}") for text in decoded.broken]
+    if readable + len(decoded.broken) != entry["samples"]:
+        problems.append(Problem(name, "wrong", f"{readable} stacks, but dataset.json says {entry['samples']}"))
+    return problems + _repeated(name, entry["split"], content, decoded.template, seen)
+
+
+def _repeated(name: str, split: str, content: bytes, templates: NDArray[np.int64], seen: _Seen) -> list[Problem]:
+    problems = []
+    for key in sample_keys(content):
+        if key in seen.keys:
+            problems.append(Problem(name, "wrong", f"key {key.decode()} is in {seen.keys[key]} too"))
+        seen.keys[key] = name
+    for template in np.unique(templates).tolist():
+        if seen.splits.setdefault(template, split) != split:
+            detail = f"template {template} is on two sides, {split} and {seen.splits[template]}"
+            problems.append(Problem(name, "wrong", detail))
+    return problems
+
+
+def sample_keys(content: bytes) -> list[bytes]:
+    """Keys of the samples in a tar, by their metadata's names."""
+    keys, suffix, at = [], b".meta.json\0", -1
+    while (at := content.find(suffix, at + 1)) >= 0:
+        header = at - at % _BLOCK
+        if b"\0" not in content[header:at]:  # else it is not a name, but part of what a member holds
+            keys.append(content[header:at])
+    return keys
+
+
+def _foreign(folder: Path, manifest: Manifest) -> list[Problem]:
+    known = {entry["file"] for entry in manifest.shards}
+    problems = [
+        Problem(path.name, "foreign", "a shard that dataset.json does not name")
+        for path in sorted(folder.glob("*.tar"))
+        if path.name not in known
+    ]
+    leftovers = [*sorted(folder.glob(".*.tmp")), *(p for p in (folder / PROGRESS, folder / PARTS) if p.exists())]
+    return problems + [Problem(path.name, "foreign", "left behind by a run that was killed") for path in leftovers]

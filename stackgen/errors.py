@@ -1,0 +1,37 @@
+"""The one exception that a user can mend, and the one way to warn."""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+from types import ModuleType
+
+
+class StackgenError(Exception):
+    """Something a user can mend: the message names what was wrong and what would be right.
+
+    The command line prints it as one line and exits with 2.
+    """
+
+
+def warn(line: str) -> None:
+    """One line on stderr, each time; Python's own form of a warning has two, and shows the same one once."""
+    warnings.warn_explicit(line, UserWarning, "stackgen", 0)
+
+
+def require(module: str, extra: str) -> ModuleType:
+    """Import an optional package.
+
+    Args:
+        module: Name to import.
+        extra: The extra of stackgen that installs it.
+
+    Raises:
+        StackgenError: If the package is not installed; the line names the extra.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name is None or not module.startswith(error.name):
+            raise
+        raise StackgenError(f"this needs the package {error.name!r}: pip install 'stackgen[{extra}]'") from error

@@ -1,0 +1,385 @@
+"""`stacks.json`: the file everything that makes, checks, draws or builds a stack speaks.
+
+The format is published as a JSON Schema beside this file, `stacks.schema.json`. Only `format` and
+`stacks` must be there; a file written by hand may stop at shapes and positions.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stackgen.errors import StackgenError
+from stackgen.io.files import write_atomically
+from stackgen.protocols import Verdict
+from stackgen.stack import Stack
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
+
+FORMAT = "stackgen.stacks/1"
+SCHEMA_PATH = Path(__file__).with_name("stacks.schema.json")
+MAX_BLOCKS_READ = 1000
+"""Blocks a stack in a file may have; the models' own limit is `MAX_BLOCKS`. The schema says the same."""
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Which weights made the stacks.
+
+    Args:
+        name: As given to `stackgen.load`.
+        sha256: Of the file, in hexadecimal.
+    """
+
+    name: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One stack of a file and what is known about it.
+
+    Args:
+        stack: As sampled or written.
+        verdict: Of a simulation.
+        front_iou: Of the settled stack's front silhouette with the target.
+        comment: For people.
+    """
+
+    stack: Stack
+    verdict: Verdict | None = None
+    front_iou: float | None = None
+    comment: str = ""
+
+
+@dataclass(frozen=True)
+class StacksFile:
+    """All that a `stacks.json` holds.
+
+    Args:
+        entries: The stacks, all of one `catalogue`.
+        catalogue: Their shapes.
+        grid: Design grid and scale of the target.
+        target: (H, W) front silhouette asked for.
+        silhouette: File name of the picture it came from.
+        block_list: (S,) counts asked for.
+        block_list_source: Whether the network chose them or a person.
+        physics: Of the verdicts, as `Physics.to_json` gives it.
+        seed: Of the sampling.
+        weights: That made the stacks.
+        sampler: The settings they were sampled with.
+        inventory: (S,) counts that the block list was chosen from; None where there was no limit.
+        cell_size: Edge of a cube [m].
+        comment: For people.
+    """
+
+    entries: tuple[Entry, ...]
+    catalogue: Catalogue = PAPER_CATALOGUE
+    grid: Grid = PAPER_GRID
+    target: Mask | None = None
+    silhouette: str | None = None
+    block_list: NDArray[np.int64] | None = None
+    block_list_source: Literal["cnn", "given"] | None = None
+    physics: Mapping[str, Any] | None = None
+    seed: int | None = None
+    weights: Weights | None = None
+    sampler: Mapping[str, Any] | None = None
+    inventory: NDArray[np.int64] | None = None
+    cell_size: float = 0.05
+    comment: str = ""
+
+    @property
+    def stacks(self) -> list[Stack]:
+        """The stacks alone."""
+        return [entry.stack for entry in self.entries]
+
+
+def read_stacks(path: str | Path) -> StacksFile:
+    """Read and check a stacks file.
+
+    Raises:
+        StackgenError: If it is missing, not JSON, of another format, or says something impossible; the
+            message names the line and column, or the JSON path.
+    """
+    try:
+        return from_json(_parse(_text(Path(path))))
+    except StackgenError as error:
+        raise StackgenError(f"{path}: {error}") from error
+
+
+def write_stacks(path: str | Path, content: StacksFile) -> None:
+    """Write a stacks file; `path` is replaced only once all is written.
+
+    Raises:
+        StackgenError: If it cannot be written.
+    """
+    write_atomically(path, (_layout(to_json(content)) + "\n").encode())
+
+
+def to_json(content: StacksFile) -> dict[str, Any]:
+    """The plain form of a stacks file; what is not known is left out, so that the rest stays readable.
+
+    >>> cube = Stack([0], [[0, 0, 0.5, 0, 0, 0]])
+    >>> to_json(StacksFile((Entry(cube),)))["stacks"]
+    [{'blocks': [{'shape': 'cube', 'position': [0.0, 0.0, 0.5], 'rotation': [0.0, 0.0, 0.0]}]}]
+    """
+    plain = {
+        "format": FORMAT,
+        "comment": content.comment or None,
+        "cell_size_m": float(content.cell_size),
+        "silhouette": content.silhouette,
+        "block_list": _counts_to_json(content.block_list, content.catalogue),
+        "block_list_source": content.block_list_source,
+        "inventory": _counts_to_json(content.inventory, content.catalogue),
+        "seed": None if content.seed is None else int(content.seed),
+        "weights": None if content.weights is None else asdict(content.weights),
+        "sampler": None if content.sampler is None else dict(content.sampler),
+        "stacks": [_entry_to_json(entry) for entry in content.entries],
+        "physics": None if content.physics is None else dict(content.physics),
+        "grid": asdict(content.grid),
+        "catalogue": content.catalogue.to_json(),
+        "silhouette_packed": None if content.target is None else _pack(content.target),
+    }
+    return {key: value for key, value in plain.items() if value is not None}
+
+
+def from_json(data: Any) -> StacksFile:
+    """Inverse of :func:`to_json`, checked against the schema and for sense.
+
+    Raises:
+        StackgenError: Naming the JSON path of the first thing that is wrong.
+    """
+    _validate(data)
+    catalogue = Catalogue.from_json(data["catalogue"]) if "catalogue" in data else PAPER_CATALOGUE
+    grid = Grid(**data["grid"]) if "grid" in data else PAPER_GRID
+    physics = data.get("physics")
+    cell_size = float(data.get("cell_size_m", (physics or {}).get("cell_size", 0.05)))
+    if physics and not math.isclose(physics.get("cell_size", cell_size), cell_size):
+        raise StackgenError(
+            f"$.cell_size_m is {cell_size}, but $.physics.cell_size is {physics['cell_size']}; make them equal"
+        )
+    packed, weights = data.get("silhouette_packed"), data.get("weights")
+    return StacksFile(
+        entries=tuple(_entry_from_json(e, catalogue, f"$.stacks[{i}]") for i, e in enumerate(data["stacks"])),
+        catalogue=catalogue,
+        grid=grid,
+        target=None if packed is None else _unpack(packed, grid),
+        silhouette=data.get("silhouette"),
+        block_list=_counts(data, "block_list", catalogue),
+        block_list_source=data.get("block_list_source"),
+        physics=physics,
+        seed=data.get("seed"),
+        weights=None if weights is None else Weights(**weights),
+        sampler=data.get("sampler"),
+        inventory=_counts(data, "inventory", catalogue),
+        cell_size=cell_size,
+        comment=data.get("comment", ""),
+    )
+
+
+def schema() -> dict[str, Any]:
+    """The published JSON Schema."""
+    return json.loads(SCHEMA_PATH.read_text(encoding="utf-8"))
+
+
+def _text(path: Path) -> str:
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except FileNotFoundError:
+        raise StackgenError("no such file") from None
+    except IsADirectoryError:
+        raise StackgenError("is a folder; give a stacks.json file") from None
+    except UnicodeDecodeError as error:
+        raise StackgenError(f"is not text in UTF-8 (byte {error.start}); give a stacks.json file") from None
+    except OSError as error:
+        raise StackgenError(f"cannot be read: {error.strerror or error}") from None
+    if not text.strip():
+        raise StackgenError("is empty; a stacks file begins with " + _BEGINNING)
+    return text
+
+
+_BEGINNING = f'{{"format": "{FORMAT}", "stacks": [...]}}'
+
+
+def _parse(text: str) -> Any:
+    """JSON without the things JSON should not have: NaN, infinities, the same key twice."""
+
+    def no_constant(name: str) -> NoReturn:
+        raise StackgenError(f"holds {name}; every number must be finite")
+
+    def finite(digits: str) -> float:
+        return float(digits) if math.isfinite(float(digits)) else no_constant(digits)
+
+    def no_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        result: dict[str, Any] = {}
+        for key, value in pairs:
+            if key in result:
+                raise StackgenError(f"has the key {key!r} twice in one object; keep one")
+            result[key] = value
+        return result
+
+    try:
+        return json.loads(text, parse_float=finite, parse_constant=no_constant, object_pairs_hook=no_twins)
+    except json.JSONDecodeError as error:
+        cut = (
+            "; the file seems cut short"
+            if error.pos >= len(text.rstrip()) or error.msg.startswith("Unterminated")
+            else ""
+        )
+        raise StackgenError(f"is not JSON at line {error.lineno}, column {error.colno}: {error.msg}{cut}") from None
+    except RecursionError:
+        raise StackgenError("is nested too deeply to be a stacks file") from None
+    except ValueError:
+        raise StackgenError("holds a number with too many digits") from None
+
+
+def _validate(data: Any) -> None:
+    """Check the plain form against the schema."""
+    if not isinstance(data, dict) or "format" not in data:
+        raise StackgenError("is not a stacks file; it begins with " + _BEGINNING)
+    if data["format"] != FORMAT:
+        raise StackgenError(f"$.format is {_short(data['format'])}; this version reads {FORMAT!r}")
+    import jsonschema
+
+    error = jsonschema.exceptions.best_match(jsonschema.Draft202012Validator(schema()).iter_errors(data))
+    if error is not None:
+        raise StackgenError(f"{error.json_path}: {_short_message(error)}")
+
+
+def _short_message(error: Any) -> str:
+    """What a schema error says, without quoting half of the file."""
+    message = " ".join(error.message.split())
+    quoted = repr(error.instance)
+    if len(quoted) > 60:
+        message = message.replace(quoted, quoted[:50] + "...", 1)
+    limits = {"minItems": "at least", "maxItems": "at most"}
+    if error.validator in limits:
+        return f"has {len(error.instance)} items; {limits[error.validator]} {error.validator_value} are possible"
+    return message if len(message) <= 220 else message[:220] + "..."
+
+
+def _short(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else text[:50] + "..."
+
+
+def _entry_to_json(entry: Entry) -> dict[str, Any]:
+    stack, verdict = entry.stack, entry.verdict
+    plain: dict[str, Any] = {"comment": entry.comment} if entry.comment else {}
+    plain["blocks"] = [{"shape": name, **pose} for name, pose in zip(stack.names, _poses_to_json(stack), strict=True)]
+    if verdict is not None:
+        plain["verdict"] = {
+            "stable": bool(verdict.stable),
+            "at_rest": bool(verdict.at_rest),
+            "fell": np.flatnonzero(verdict.fell).tolist(),
+            "drop": np.asarray(verdict.drop, dtype=float).tolist(),
+            "settled": _poses_to_json(verdict.settled),
+        }
+        if verdict.margin is not None:
+            plain["verdict"]["margin"] = float(verdict.margin)
+    if entry.front_iou is not None:
+        plain["front_iou"] = float(entry.front_iou)
+    return plain
+
+
+def _poses_to_json(stack: Stack) -> list[dict[str, list[float]]]:
+    return [{"position": pose[:3], "rotation": pose[3:]} for pose in stack.poses.tolist()]
+
+
+def _entry_from_json(item: Mapping[str, Any], catalogue: Catalogue, path: str) -> Entry:
+    shapes = []
+    for i, block in enumerate(item["blocks"]):
+        if block["shape"] not in catalogue.names:
+            known = ", ".join(catalogue.names)
+            raise StackgenError(f"{path}.blocks[{i}].shape: unknown shape {_short(block['shape'])}; there are {known}")
+        shapes.append(catalogue.index(block["shape"]))
+    stack = Stack(np.array(shapes), _poses_from_json(item["blocks"]), catalogue)
+    said = item.get("verdict")
+    verdict = None if said is None else _verdict_from_json(said, stack, f"{path}.verdict")
+    return Entry(stack, verdict, item.get("front_iou"), item.get("comment", ""))
+
+
+def _poses_from_json(items: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:
+    return np.array([[*item["position"], *item.get("rotation", (0, 0, 0))] for item in items], dtype=np.float64)
+
+
+def _verdict_from_json(said: Mapping[str, Any], stack: Stack, path: str) -> Verdict:
+    """The verdict, if it is one about this stack."""
+    for key in ("drop", "settled"):
+        if len(said[key]) != len(stack):
+            raise StackgenError(
+                f"{path}.{key}: {len(said[key])} values for {len(stack)} blocks; give one for each block"
+            )
+    if any(number >= len(stack) for number in said["fell"]):
+        raise StackgenError(f"{path}.fell: blocks are numbered 0 to {len(stack) - 1}, got {_short(said['fell'])}")
+    if said["stable"] == bool(said["fell"]):
+        raise StackgenError(f"{path}: stable is {str(said['stable']).lower()}, but {len(said['fell'])} blocks fell")
+    fell = np.zeros(len(stack), dtype=bool)
+    fell[np.asarray(said["fell"], dtype=int)] = True
+    settled = stack.with_poses(_poses_from_json(said["settled"]))
+    drop = np.asarray(said["drop"], dtype=float)
+    return Verdict(said["stable"], fell, drop, settled, said.get("at_rest", True), said.get("margin"))
+
+
+def _counts_to_json(counts: NDArray[np.int64] | None, catalogue: Catalogue) -> dict[str, int] | None:
+    """Counts (S,) by name, without zeros."""
+    return None if counts is None else {n: int(c) for n, c in zip(catalogue.names, counts, strict=True) if c}
+
+
+def _counts(data: Mapping[str, Any], key: str, catalogue: Catalogue) -> NDArray[np.int64] | None:
+    """(S,) counts that stand under a key."""
+    items = data.get(key)
+    if items is None:
+        return None
+    for name in items:
+        if name not in catalogue.names:
+            raise StackgenError(f"$.{key}: unknown shape {_short(name)}; there are {', '.join(catalogue.names)}")
+    return np.array([items.get(name, 0) for name in catalogue.names], dtype=np.int64)
+
+
+def _pack(mask: Mask) -> dict[str, Any]:
+    bits = np.packbits(np.asarray(mask, dtype=bool), axis=1)
+    return {"size": list(mask.shape), "bits": base64.b64encode(bits.tobytes()).decode("ascii")}
+
+
+def _unpack(packed: Mapping[str, Any], grid: Grid) -> Mask:
+    height, width = packed["size"]
+    if (height, width) != (grid.image_size,) * 2:
+        raise StackgenError(
+            f"$.silhouette_packed.size is {height} x {width}, but the grid's pictures are {grid.image_size} square"
+        )
+    try:
+        data = base64.b64decode(packed["bits"], validate=True)
+    except (binascii.Error, ValueError):
+        raise StackgenError("$.silhouette_packed.bits: is not base64; write it anew or leave it out") from None
+    wanted = height * -(-width // 8)
+    if len(data) != wanted:
+        raise StackgenError(f"$.silhouette_packed.bits: {len(data)} bytes, but {height} x {width} pixels take {wanted}")
+    rows = np.frombuffer(data, dtype=np.uint8).reshape(height, -1)
+    return np.unpackbits(rows, axis=1, count=width).astype(bool)
+
+
+def _layout(value: Any, indent: int = 0) -> str:
+    """JSON text for people: what fits on a line is on a line.
+
+    >>> print(_layout({"a": [1, 2]}))
+    {"a": [1, 2]}
+    """
+    line = json.dumps(value, ensure_ascii=False, allow_nan=False)
+    if len(line) + indent <= 160 or not isinstance(value, dict | list) or not value:
+        return line
+    pad = " " * (indent + 1)
+    if isinstance(value, dict):
+        inner = [f"{pad}{json.dumps(k, ensure_ascii=False)}: {_layout(v, indent + 1)}" for k, v in value.items()]
+    else:
+        inner = [pad + _layout(v, indent + 1) for v in value]
+    opening, closing = "{}" if isinstance(value, dict) else "[]"
+    return f"{opening}\n" + ",\n".join(inner) + f"\n{' ' * indent}{closing}"

@@ -1,0 +1,75 @@
+"""Training the block-list CNN: a thin Lightning shell around BlockListNetwork."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from torch import Tensor
+
+from stackgen._lightning import pl
+from stackgen.models.block_list.network import BlockListNetwork, CNNConfig, CNNPredictor
+from stackgen.models.module import WorldMixin
+from stackgen.models.optimization import OptimizerConfig, configure_optimizer
+
+
+class BlockListCNN(WorldMixin, pl.LightningModule):
+    """Predicts the block list from the silhouette: the true list's log-probability grows (paper, Eq. 5).
+
+    Args:
+        cnn: Architecture.
+        optimizer: Learning rate and its course.
+    """
+
+    kind = "blocklist"
+
+    def __init__(
+        self,
+        cnn: CNNConfig = CNNConfig(),  # noqa: B008 - frozen
+        optimizer: OptimizerConfig = OptimizerConfig(),  # noqa: B008
+    ) -> None:
+        super().__init__()
+        self.config: dict[str, Any] = {"cnn": asdict(cnn)}
+        self.optimizer_config = optimizer
+        self._cnn = cnn
+        self.model: BlockListNetwork
+
+    def build(self) -> None:
+        """Make the network once its world is known."""
+        if not hasattr(self, "model"):
+            self.model = BlockListNetwork(self._cnn, self.catalogue, self.max_blocks, self.grid)
+
+    def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
+        """One step of the cross-entropy."""
+        features = self.model.features(batch["silhouette"])
+        loss = self._loss(features, batch["counts"])
+        self.log("train/loss", loss, prog_bar=True)
+        return loss
+
+    def validation_step(self, batch: dict[str, Tensor], index: int) -> None:
+        """Cross-entropy, exact match and top 3 on held-out stacks."""
+        features, truth = self.model.features(batch["silhouette"]), batch["counts"]
+        loss, hits = self._loss(features, truth), self._hits(features, truth)
+        size = len(hits)
+        self.log_mean("validation/loss", loss, size, prog_bar=True)
+        self.log_mean("validation/exact", hits[:, 0].float().mean(), size, prog_bar=True)
+        self.log_mean("validation/top3", hits.any(-1).float().mean(), size)
+
+    def _loss(self, features: Tensor, truth: Tensor) -> Tensor:
+        """Mean cross-entropy of the true lists (B, S)."""
+        return -self.model.out.log_probabilities(features, truth[:, None]).mean()
+
+    def _hits(self, features: Tensor, truth: Tensor) -> Tensor:
+        """Whether each of the three best lists is the true one (B, 3)."""
+        return (self.model.out.best(features, 3) == truth[:, None]).all(-1)
+
+    def configure_optimizers(self) -> Any:
+        """AdamW and its learning-rate course."""
+        return configure_optimizer(self, self.optimizer_config)
+
+    def predictor(self) -> CNNPredictor:
+        """The network as a BlockListPredictor, sharing its weights."""
+        was_training = self.model.training
+        predictor = CNNPredictor(self.model, self.catalogue, self.grid, self.max_blocks)
+        self.model.train(was_training)
+        return predictor

@@ -1,0 +1,314 @@
+"""Diffusion over block poses: normalisation, training target and sampling, without any training framework."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor, nn
+
+from stackgen.errors import StackgenError
+from stackgen.models.diffusion.denoiser import POSE, Denoiser, DenoiserConfig, raster_order
+from stackgen.models.diffusion.samplers import Callback, Predict, ancestral, multistep
+from stackgen.models.diffusion.schedules import Schedule, ScheduleConfig
+from stackgen.models.diffusion.settings import SamplerConfig
+from stackgen.models.network_sampler import NetworkSampler
+from stackgen.stack import Stack
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
+
+
+@dataclass(frozen=True)
+class DiffusionConfig:
+    """What is diffused and what the network estimates.
+
+    Args:
+        prediction: `epsilon`, the noise (paper), or `v` (Salimans & Ho 2022), which weights the
+            noisy steps, where the layout is decided, more.
+        clip: Bound of the clean estimate while sampling, in standard deviations; null for none.
+        least_std: Lower bound of the standard deviation that a dimension is divided by [cell, rad].
+            Settled stacks hardly vary in y and in rotation; without a bound the rare slanted block
+            would be hundreds of standard deviations away.
+        variance: Of ancestral sampling's noise: `beta` (paper) or `posterior`, see samplers.ancestral.
+        drop_silhouette: Share of the training samples that are shown an empty picture, so that the model can be
+            guided by itself without the silhouette (Ho & Salimans 2022).
+        guidance: Weight of that guidance while sampling; 1 is none. It needs `drop_silhouette`.
+
+    Raises:
+        StackgenError: If a number is out of its range.
+    """
+
+    prediction: Literal["epsilon", "v"] = "epsilon"
+    clip: float | None = None
+    least_std: float = 0.0
+    variance: Literal["beta", "posterior"] = "beta"
+    drop_silhouette: float = 0.0
+    guidance: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.drop_silhouette < 1:
+            raise StackgenError(f"diffusion.drop_silhouette must lie in [0, 1), got {self.drop_silhouette}")
+        if self.guidance != 1 and not self.drop_silhouette:
+            raise StackgenError("diffusion.guidance needs diffusion.drop_silhouette, such as 0.1")
+
+
+class PoseDiffusion(nn.Module):
+    """The denoiser with its schedule and the normalisation of poses.
+
+    Args:
+        denoiser, schedule, diffusion: Their descriptions.
+        num_shapes: Size of the catalogue.
+        image_size: Edge of the silhouette [pixel].
+        max_blocks: N.
+    """
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(
+        self,
+        denoiser: DenoiserConfig,
+        schedule: ScheduleConfig,
+        diffusion: DiffusionConfig,
+        num_shapes: int = 4,
+        image_size: int = 64,
+        max_blocks: int = MAX_BLOCKS,
+    ) -> None:
+        super().__init__()
+        self.config = diffusion
+        self.schedule = Schedule(schedule)
+        self.denoiser = Denoiser(denoiser, num_shapes, image_size, max_blocks)
+        self.register_buffer("mean", torch.zeros(POSE))
+        self.register_buffer("std", torch.ones(POSE))
+
+    def fit_normalization(self, mean: ArrayLike, std: ArrayLike) -> None:
+        """Take over the training poses' statistics (6,) [cell, rad]."""
+        self.mean.copy_(torch.as_tensor(np.asarray(mean)))
+        self.std.copy_(torch.as_tensor(np.asarray(std)).clamp(min=max(self.config.least_std, 1e-6)))
+
+    def loss(
+        self,
+        batch: dict[str, Tensor],
+        draws: int = 1,
+        generator: torch.Generator | None = None,
+        drop_silhouette: float = 0.0,
+    ) -> tuple[Tensor, Tensor]:
+        """Mean squared error per sample and draw, averaged over its real blocks (paper, Eq. 3).
+
+        Args:
+            batch: As the DataModule makes it.
+            draws: Noise draws of every sample; they share one look at the silhouette.
+            generator: Of steps and noise; the global one by default.
+            drop_silhouette: Share of the samples that are shown an empty picture.
+
+        Returns:
+            Losses and their steps t, both (B * draws,).
+        """
+        poses, shapes, mask = batch["poses"], batch["shapes"], batch["mask"]
+        if self.denoiser.config.ordered:
+            order = raster_order(poses, shapes)
+            poses = poses.gather(1, order[..., None].expand_as(poses))
+            shapes, mask = shapes.gather(1, order), mask.gather(1, order)
+        clean = ((poses - self.mean) / self.std).repeat_interleave(draws, 0)
+        mask, shapes = mask.repeat_interleave(draws, 0), shapes.repeat_interleave(draws, 0)
+        t = torch.randint(1, self.schedule.steps + 1, (len(clean),), generator=generator, device=clean.device)
+        noise = torch.randn(clean.shape, generator=generator, device=clean.device, dtype=clean.dtype)
+        noisy = self.schedule.diffuse(clean, noise, t)
+        silhouettes = batch["silhouette"]
+        if drop_silhouette:
+            kept = torch.rand(len(silhouettes), generator=generator, device=clean.device) >= drop_silhouette
+            silhouettes = silhouettes * kept[:, None, None]
+        memory = self.denoiser.encode(silhouettes)
+        seen = (
+            self._own_estimate(noisy, t, shapes, mask, memory, draws)
+            if self.denoiser.config.self_conditioning
+            else None
+        )
+        estimate = self.denoiser(noisy, t, shapes, mask, memory, seen)
+        target = noise if self.config.prediction == "epsilon" else self._velocity(clean, noise, t)
+        error = (estimate - target).square().mean(-1) * mask
+        return error.sum(-1) / mask.sum(-1), t
+
+    @torch.no_grad()
+    def _own_estimate(
+        self, noisy: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor, draws: int
+    ) -> Tensor:
+        """What the network makes of every second draw (of every second sample, where each has one); zeros elsewhere."""
+        rows = torch.arange(len(noisy), device=noisy.device)
+        chosen = rows % 2 == 0
+        if draws == 1:
+            memory = memory[chosen]
+        elif draws % 2:
+            chosen = rows % draws < draws // 2
+        found = torch.zeros_like(noisy)
+        estimate = self.denoiser(noisy[chosen], t[chosen], shapes[chosen], mask[chosen], memory)
+        found[chosen] = self._clean(noisy[chosen], t[chosen], estimate)
+        return found
+
+    def _clean(self, x: Tensor, t: Tensor, estimate: Tensor) -> Tensor:
+        """The clean poses that an output of the network means, bounded as in the sampler."""
+        signal, sigma = self.schedule.signal_and_noise(t)
+        clean = signal * x - sigma * estimate if self.config.prediction == "v" else (x - sigma * estimate) / signal
+        return self._bounded(clean)
+
+    def _bounded(self, clean: Tensor) -> Tensor:
+        return clean if self.config.clip is None else clean.clamp(-self.config.clip, self.config.clip)
+
+    def _velocity(self, clean: Tensor, noise: Tensor, t: Tensor) -> Tensor:
+        signal, sigma = self.schedule.signal_and_noise(t)
+        return signal * noise - sigma * clean
+
+    @torch.inference_mode()
+    def sample(
+        self,
+        silhouettes: Tensor,
+        shapes: Tensor,
+        mask: Tensor,
+        generator: torch.Generator,
+        callback: Callback | None = None,
+        sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
+        guide: PoseDiffusion | None = None,
+    ) -> Tensor:
+        """Poses (B, N, 6) [cell, rad] for silhouettes (B / n, H, W), each serving n rows of shapes (B, N).
+
+        Args:
+            silhouettes, shapes, mask: As the denoiser takes them.
+            generator: Of all noise.
+            callback: Told (t, poses [cell, rad]) before each step and (0, poses) at the end.
+            sampler: The way from noise to poses.
+            guide: The other version of this model that `sampler` asks for.
+        """
+        config = self.complete(sampler)
+        predict = self._predictor(silhouettes, shapes, mask)
+        if guide is not None:
+            predict = self._guided(predict, guide._predictor(silhouettes, shapes, mask), config)
+        elif config.guidance is not None and config.guidance != 1:
+            predict = self._guided(predict, self._predictor(torch.zeros_like(silhouettes), shapes, mask), config)
+        shown = None if callback is None else (lambda t, x: callback(t, x * self.std + self.mean))
+        noise = torch.randn((*shapes.shape, POSE), generator=generator, device=generator.device).to(shapes.device)
+        assert config.steps and config.spacing
+        steps = self.schedule.subset(config.steps, config.spacing)
+        if config.kind == "ddpm":
+            posterior = config.variance == "posterior"
+            x = ancestral(predict, noise, self.schedule, generator, steps, posterior, shown)
+        else:
+            order, eta = 2 if config.kind == "dpm" else 1, config.eta or 0.0
+            x = multistep(predict, noise, self.schedule, generator, steps, order, eta, shown)
+        return x * self.std + self.mean
+
+    def complete(self, sampler: SamplerConfig) -> SamplerConfig:
+        """A sampler's settings with this model's own for what is null.
+
+        Raises:
+            StackgenError: If they do not fit the model.
+        """
+        own = self.config.guidance if self.config.drop_silhouette else None
+        return sampler.complete(self.schedule.steps, self.config.variance, own)
+
+    def _predictor(self, silhouettes: Tensor, shapes: Tensor, mask: Tensor) -> Predict:
+        """What estimates the clean poses of some scenes; it reads their silhouettes once."""
+        memory = self.denoiser.encode(silhouettes)
+        last: Tensor | None = None
+
+        def predict(x: Tensor, t: Tensor) -> Tensor:
+            nonlocal last
+            last = self._clean(x, t, self.denoiser(x, t, shapes, mask, memory, last))
+            return last
+
+        return predict
+
+    @property
+    def trims(self) -> bool:
+        """See DenoiserConfig."""
+        return self.denoiser.config.trims
+
+    def _guided(self, own: Predict, other: Predict, config: SamplerConfig) -> Predict:
+        """Away from what another predictor would do, a weaker model or this one blind, or towards it."""
+        assert config.guided is not None and config.guidance is not None
+        first, last = (share * self.schedule.steps for share in config.guided)
+        weight = config.guidance
+
+        def predict(x: Tensor, t: Tensor) -> Tensor:
+            if not first <= int(t) <= last:
+                return own(x, t)
+            theirs = other(x, t)
+            return self._bounded(theirs + weight * (own(x, t) - theirs)) if weight else theirs
+
+        return predict
+
+    def guided_by(self, other: PoseDiffusion) -> bool:
+        """Whether another model's estimates mean the same as this one's: same schedule, same normalisation."""
+        same = torch.allclose(self.mean, other.mean, atol=1e-3) and torch.allclose(self.std, other.std, rtol=1e-3)
+        return same and self.schedule.config == other.schedule.config
+
+
+class DiffusionSampler(NetworkSampler[PoseDiffusion]):
+    """A StackSampler: the diffusion model with its world.
+
+    Args:
+        model: Trained.
+        catalogue, grid, max_blocks: The world it was trained in.
+        card: What is known about the weights.
+        batch: Stacks denoised together, at most.
+        sampler: The way from noise to poses; what is null is as the card has it, else the model.
+
+    Raises:
+        StackgenError: If the settings do not fit the model, or there is no such guide.
+    """
+
+    def __init__(
+        self,
+        model: PoseDiffusion,
+        catalogue: Catalogue = PAPER_CATALOGUE,
+        grid: Grid = PAPER_GRID,
+        max_blocks: int = MAX_BLOCKS,
+        card: dict[str, Any] | None = None,
+        batch: int = 512,
+        sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
+    ) -> None:
+        super().__init__(model, catalogue, grid, max_blocks, card, batch)
+        self.sampler = self.model.complete(sampler.over(SamplerConfig.of_card(self.card)))
+        self.guide = None if self.sampler.guide is None else self._guide(self.sampler.guide)
+
+    def configured(self, sampler: SamplerConfig) -> DiffusionSampler:
+        """The same model with other settings, where they are not null."""
+        world = self.catalogue, self.grid, self.max_blocks
+        return DiffusionSampler(self.model, *world, self.card, self.batch, sampler)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """How it samples, for the record."""
+        return self.sampler.given()
+
+    def _guide(self, weights: str) -> PoseDiffusion:
+        from stackgen.models.weights import load_sampler  # which imports this module
+
+        other = load_sampler(weights)
+        if not isinstance(other, DiffusionSampler) or not self.model.guided_by(other.model):
+            raise StackgenError(
+                f"sampler.guide: {weights} is no diffusion model of the same noise schedule and normalisation"
+            )
+        return other.model
+
+    def sample_batch(
+        self,
+        silhouettes: Mask,
+        counts: NDArray[np.int64],
+        num_samples: int,
+        seed: int,
+        callback: Callable[[int, NDArray[np.float64]], None] | None = None,
+    ) -> list[list[Stack]]:
+        """See StackSampler; `callback` gets (t, poses (B * num_samples, N, 6)) as the noise goes away.
+
+        Raises:
+            StackgenError: If a block list is empty or longer than the model takes, or sizes differ.
+        """
+        shown = None if callback is None else (lambda t, x: callback(t, x.double().cpu().numpy()))
+
+        def draw(pictures: Tensor, shapes: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
+            return self.model.sample(pictures, shapes, mask, generator, shown, self.sampler, self.guide)
+
+        return self._answer(silhouettes, counts, num_samples, seed, draw)

@@ -1,0 +1,115 @@
+"""How a diffusion model samples: settings that can be given on the command line, without importing torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+from stackgen.errors import StackgenError
+
+SamplerKind = Literal["ddpm", "ddim", "dpm"]
+SPACING = 1.3
+"""Default of `SamplerConfig.spacing`: best for 4 to 8 steps on validation scenes, see docs/sampling.md."""
+
+_OF_KIND = {"ddpm": "variance", "ddim": "eta", "dpm": "eta"}
+
+
+@dataclass(frozen=True)
+class SamplerConfig:
+    """The way from noise to poses; what is null is as the weights have it.
+
+    Args:
+        kind: `ddpm`, ancestral (paper); `ddim` (Song et al. 2021); `dpm`, DPM-Solver++ (2M), which looks back
+            one step (Lu et al. 2022).
+        steps: Calls of the network, 1..T; by default all T.
+        spacing: At 1 the steps lie evenly in t; above, they get closer towards the clean end, as the power
+            `spacing` of even ones.
+        eta: Share of fresh noise in each step of `ddim` and `dpm`: 0 for none, 1 for as much as `ddpm` has.
+        variance: Of the noise of `ddpm`: `beta` (paper) or `posterior`, see samplers.ancestral.
+        guide: Weights of a weaker version of the model, for autoguidance (Karras et al. 2024): the estimate is
+            weak + guidance (strong - weak).
+        guidance: Its weight; 1 is none, 0 leaves the weaker model alone to act there. Without a guide a model that
+            was trained with `drop_silhouette` takes that part itself, without the silhouette (classifier-free
+            guidance, Ho & Salimans 2022).
+        guided: Where it acts, as shares of T: from which to which t.
+
+    Raises:
+        StackgenError: If a number is out of its range.
+    """
+
+    kind: SamplerKind | None = None
+    steps: int | None = None
+    spacing: float | None = None
+    eta: float | None = None
+    variance: Literal["beta", "posterior"] | None = None
+    guide: str | None = None
+    guidance: float | None = None
+    guided: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if self.guided is not None:
+            object.__setattr__(self, "guided", tuple(self.guided))  # JSON has lists
+        if self.steps is not None and self.steps < 1:
+            raise StackgenError(f"sampler.steps must be at least 1, got {self.steps}")
+        if self.spacing is not None and not 1 <= self.spacing <= 10:
+            raise StackgenError(f"sampler.spacing must lie in 1..10, got {self.spacing}")
+        if self.eta is not None and not 0 <= self.eta <= 1:
+            raise StackgenError(f"sampler.eta must lie in 0..1, got {self.eta}")
+        if self.guidance is not None and not 0 <= self.guidance <= 100:
+            raise StackgenError(f"sampler.guidance must lie in 0..100, got {self.guidance}")
+        if self.guided is not None and not 0 <= self.guided[0] < self.guided[1] <= 1:
+            raise StackgenError(f"sampler.guided must be two shares of T, such as [0.3, 1], got {list(self.guided)}")
+
+    def over(self, base: SamplerConfig) -> SamplerConfig:
+        """These settings, and those of `base` for what is null here; another kind's noise does not carry over.
+
+        >>> SamplerConfig(kind="ddim").over(SamplerConfig(kind="ddpm", steps=8, variance="beta"))
+        ... # doctest: +ELLIPSIS
+        SamplerConfig(kind='ddim', steps=8, spacing=None, eta=None, variance=None, ...)
+        """
+        if self.kind not in (None, base.kind):
+            base = replace(base, eta=None, variance=None)
+        return SamplerConfig(**{**asdict(base), **self.given()})
+
+    def complete(
+        self, steps: int, variance: Literal["beta", "posterior"], guidance: float | None = None
+    ) -> SamplerConfig:
+        """Nothing null that matters: with the model's T, its `variance` and its own `guidance`, null if it has none.
+
+        Raises:
+            StackgenError: If a setting belongs to another kind, or there are more steps than T.
+        """
+        kind = self.kind or "ddpm"
+        for name in {"eta", "variance"} - {_OF_KIND[kind]}:
+            if getattr(self, name) is not None:
+                raise StackgenError(f"sampler.{name} is not for {kind}; set {_OF_KIND[kind]}, or another kind")
+        if self.steps is not None and self.steps > steps:
+            raise StackgenError(f"sampler.steps: this model has {steps} steps, not {self.steps}")
+        if self.guide is not None:
+            guidance = 1.5
+        elif guidance is None and (self.guidance is not None or self.guided is not None):
+            raise StackgenError(
+                "sampler.guidance and sampler.guided need sampler.guide, weights of a weaker model,"
+                " or a model trained with diffusion.drop_silhouette"
+            )
+        defaults = SamplerConfig(kind, steps, SPACING, **({"variance": variance} if kind == "ddpm" else {"eta": 0.0}))
+        if guidance is not None:
+            defaults = replace(defaults, guidance=guidance, guided=(0.0, 1.0))
+        return replace(defaults, **self.given())
+
+    @staticmethod
+    def of_card(card: Mapping[str, Any]) -> SamplerConfig:
+        """What the card of some weights says of sampling them.
+
+        Raises:
+            StackgenError: If it says what no sampler can do.
+        """
+        try:
+            return SamplerConfig(**card.get("sampler", {}))
+        except TypeError as error:
+            raise StackgenError(f"the weights card of {card.get('name')}: sampler: {error}") from error
+
+    def given(self) -> dict[str, Any]:
+        """What is not null, as JSON allows."""
+        return {name: value for name, value in asdict(self).items() if value is not None}

@@ -1,0 +1,212 @@
+"""How near the arm comes to anything: a copy of the cell in which nothing moves by itself.
+
+Arm, jaws and blocks are put where a plan has them and Bullet is asked for closest points. Lengths in metres.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from stackgen.robot.planning.urdf import BASE, FINGER_JOINTS, FINGERS, self_collision_pairs, with_jaws
+from stackgen.robot.workcell import Cell
+from stackgen.sim.physics import Physics
+from stackgen.sim.simulator import Mold, bullet
+from stackgen.stack import Stack
+from stackgen.world import Shape
+
+Floats = NDArray[np.float64]
+
+SEEN = 0.05
+"""Distances beyond this are not looked for [m]."""
+
+TABLE = -1
+"""Number of the table where blocks are numbered from 0."""
+
+
+@dataclass(frozen=True)
+class Near:
+    """The least distance found.
+
+    Args:
+        distance: [m]; `SEEN` where nothing is nearer.
+        between: What, in words.
+    """
+
+    distance: float = SEEN
+    between: str = "nothing"
+
+    def __lt__(self, other: Near) -> bool:
+        return self.distance < other.distance
+
+
+def block_frame(pose: Floats, cell_size: float) -> Floats:
+    """(4, 4) frame [m] of a block's pose (6,) [cell, rad]."""
+    frame = np.eye(4)
+    frame[:3, :3] = Rotation.from_rotvec(pose[3:]).as_matrix()
+    frame[:3, 3] = pose[:3] * cell_size
+    return frame
+
+
+def block_pose(frame: Floats, cell_size: float) -> Floats:
+    """Inverse of :func:`block_frame`."""
+    return np.concatenate([frame[:3, 3] / cell_size, Rotation.from_matrix(frame[:3, :3]).as_rotvec()])
+
+
+def body_placement(shape: Shape, frame: Floats, cell_size: float) -> tuple[list[float], list[float]]:
+    """Centre of mass [m] and quaternion of a block at a frame: what Bullet calls a body's pose."""
+    position = frame[:3, 3] + frame[:3, :3] @ (shape.center_of_mass * cell_size)
+    return position.tolist(), Rotation.from_matrix(frame[:3, :3]).as_quat().tolist()
+
+
+def load_arm(cell: Cell, client: int, visual: bool) -> int:
+    """Load the arm with its jaws at its place; returns its body."""
+    with tempfile.TemporaryDirectory(prefix="stackgen-") as folder:
+        file = Path(folder) / "ur5_jaws.urdf"
+        file.write_text(with_jaws(cell.jaws, visual))
+        yaw = Rotation.from_matrix(cell.base.table_from_base[:3, :3]).as_quat().tolist()
+        return int(bullet.loadURDF(str(file), list(cell.base.position), yaw, useFixedBase=True, physicsClientId=client))
+
+
+@dataclass(frozen=True)
+class ArmIndices:
+    """Bullet's numbers of the arm's links and joints; a joint and the link after it share theirs.
+
+    Args:
+        links: By name.
+        arm: The six joints.
+        fingers: The two jaws.
+    """
+
+    links: dict[str, int]
+    arm: tuple[int, ...]
+    fingers: tuple[int, ...]
+
+    @staticmethod
+    def of(body: int, client: int) -> ArmIndices:
+        """Read them."""
+        numbers = range(bullet.getNumJoints(body, physicsClientId=client))
+        infos = [bullet.getJointInfo(body, number, physicsClientId=client) for number in numbers]
+        links = {info[12].decode(): info[0] for info in infos} | {BASE: -1}
+        by_name = {info[1].decode(): info[0] for info in infos}
+        arm = tuple(info[0] for info in infos if info[2] == bullet.JOINT_REVOLUTE)
+        return ArmIndices(links, arm, tuple(by_name[name] for name in FINGER_JOINTS))
+
+    def name(self, link: int) -> str:
+        """Of a link."""
+        return next(name for name, number in self.links.items() if number == link)
+
+
+class Clearances:
+    """Measures distances in a cell with blocks.
+
+    Args:
+        cell: With the arm.
+        stack: Whose blocks there are.
+        physics: Of their sizes.
+    """
+
+    def __init__(self, cell: Cell, stack: Stack, physics: Physics) -> None:
+        self.cell, self.stack, self.physics = cell, stack, physics
+        self._client = bullet.connect(bullet.DIRECT)
+        self._arm = load_arm(cell, self._client, visual=False)
+        self.indices = ArmIndices.of(self._arm, self._client)
+        slab = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=[2, 2, 0.5], physicsClientId=self._client)
+        self._table = bullet.createMultiBody(0, slab, -1, [0, 0, -0.5], physicsClientId=self._client)
+        molds = [Mold.cast(shape, physics, self._client) for shape in stack.catalogue]
+        self._blocks = [
+            bullet.createMultiBody(0, molds[shape].collision, -1, [0, 0, -5 - n], physicsClientId=self._client)
+            for n, shape in enumerate(stack.shapes)
+        ]
+        for block, shape in zip(self._blocks, stack.shapes, strict=True):
+            bullet.changeDynamics(block, -1, **molds[shape].dynamics, physicsClientId=self._client)
+        links = self.indices.links
+        self._pairs = [(links[a], links[b]) for a, b in self_collision_pairs()]
+        self._standing = {links[BASE], links["shoulder_link"]}  # the arm's foot is at home on the table
+        self._fingers = {links[name] for name in FINGERS}
+
+    def put_block(self, number: int, frame: Floats) -> None:
+        """Put a block at a frame (4, 4)."""
+        shape = self.stack.catalogue[int(self.stack.shapes[number])]
+        position, quaternion = body_placement(shape, frame, self.physics.cell_size)
+        bullet.resetBasePositionAndOrientation(self._blocks[number], position, quaternion, physicsClientId=self._client)
+
+    def put_arm(self, joints: Floats, opening: float) -> None:
+        """Put the arm at joint angles (6,) [rad], the jaws open by so much [m]."""
+        for index, angle in zip(self.indices.arm, joints.tolist(), strict=True):
+            bullet.resetJointState(self._arm, index, angle, physicsClientId=self._client)
+        for index in self.indices.fingers:
+            bullet.resetJointState(self._arm, index, opening / 2, physicsClientId=self._client)
+
+    def of_arm(self, blocks: Iterable[int], touched: int | None = None) -> Near:
+        """The arm and its jaws from the table, from itself and from some blocks.
+
+        Finger tips go near the table on purpose; the workspace's lowest height is what keeps them off it.
+
+        Args:
+            blocks: Their numbers.
+            touched: The block that the fingers may touch.
+        """
+        nearest = self._to(self._table, "the table", self._standing | self._fingers)
+        for number in blocks:
+            skipped = self._fingers if number == touched else set()
+            nearest = min(nearest, self._to(self._blocks[number], f"block {number}", skipped))
+        for a, b in self._pairs:
+            for point in bullet.getClosestPoints(
+                self._arm, self._arm, SEEN, linkIndexA=a, linkIndexB=b, physicsClientId=self._client
+            ):
+                nearest = min(nearest, Near(point[8], f"{self.indices.name(a)} and {self.indices.name(b)}"))
+        return nearest
+
+    def of_block(self, number: int, others: Iterable[int], but: Collection[int] = ()) -> Near:
+        """A block from the table and from other blocks.
+
+        Args:
+            number: Of the block.
+            others: Blocks that there are.
+            but: Blocks, and `TABLE`, that it may touch.
+        """
+        nearest = Near()
+        for other in (*others, TABLE):
+            if other == number or other in but:
+                continue
+            body = self._table if other == TABLE else self._blocks[other]
+            name = "the table" if other == TABLE else f"block {other}"
+            for point in bullet.getClosestPoints(self._blocks[number], body, SEEN, physicsClientId=self._client):
+                nearest = min(nearest, Near(point[8], f"block {number} and {name}"))
+        return nearest
+
+    def touching(self, number: int, others: Iterable[int], within: float) -> frozenset[int]:
+        """Blocks, and `TABLE`, that a block is this near to [m]."""
+        bodies = {other: self._blocks[other] for other in others if other != number} | {TABLE: self._table}
+        return frozenset(
+            other
+            for other, body in bodies.items()
+            if bullet.getClosestPoints(self._blocks[number], body, within, physicsClientId=self._client)
+        )
+
+    def _to(self, body: int, name: str, but: Collection[int]) -> Near:
+        points = bullet.getClosestPoints(self._arm, body, SEEN, physicsClientId=self._client)
+        return min(
+            (Near(point[8], f"{self.indices.name(point[3])} and {name}") for point in points if point[3] not in but),
+            default=Near(),
+        )
+
+    def close(self) -> None:
+        """Give the world's memory back."""
+        if self._client >= 0:
+            bullet.disconnect(self._client)
+            self._client = -1
+
+    def __enter__(self) -> Clearances:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()

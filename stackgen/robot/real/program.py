@@ -1,0 +1,153 @@
+"""What a UR controller is asked: the motions of a plan as poses of its own base frame, within the cell's limits.
+
+A plan's motions are joint angles of the nominal arm. Every real arm is a little different, and its controller knows
+how: it is told where the finger tips are to be, and which joint angles are near. So it places blocks as exactly as it
+was calibrated, on a path that differs from the checked one by no more than the arm from its description.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from stackgen.errors import StackgenError
+from stackgen.robot.backend import Close
+from stackgen.robot.planning.motion import Motion
+from stackgen.robot.planning.plan import BlockPlan
+from stackgen.robot.planning.urdf import Chain, ur5_chain
+from stackgen.robot.workcell import Cell, pose
+
+Floats = NDArray[np.float64]
+
+CONTROLLER_FROM_BASE = pose((0.0, 0.0, 0.0), 180.0)
+"""(4, 4) the URDF's base_link in the controller's base frame: the same origin, turned by 180 degrees about z."""
+
+_SAMPLES = 17  # of a motion, to find its speeds and to look for the workspace's walls
+_SLACK = 1e-6
+_SLOWEST = 0.002  # that the controller is ever asked for [m/s, rad/s]
+
+
+@dataclass(frozen=True)
+class Controller:
+    """The real arm's controller, and what hangs on its flange.
+
+    Args:
+        host: Its address; --host overrides it.
+        payload: Of the jaws [kg].
+        center_of_gravity: Of the jaws in the flange's frame [m].
+        near_home: How far each joint may stand from the home position when a build begins [deg].
+        agreement: Between where the controller says the finger tips are and where the URDF does [m]; more is
+            another arm, or another tool.
+    """
+
+    host: str = ""
+    payload: float = 1.0
+    center_of_gravity: tuple[float, float, float] = (0.0, 0.0, 0.06)
+    near_home: float = 5.0
+    agreement: float = 0.01
+
+    def __post_init__(self) -> None:
+        for name in ("payload", "near_home", "agreement"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise StackgenError(f"controller: {name} must be positive, got {getattr(self, name):g}")
+
+
+@dataclass(frozen=True)
+class Move:
+    """One motion as a controller is asked for it.
+
+    Args:
+        name: Its part in the work.
+        kind: `joint` (movej) or `line` (movel).
+        pose: (6,) of the finger tips in the controller's base frame, position [m] and rotation vector [rad].
+        joints: (6,) of the nominal arm there [rad].
+        speed: Of the leading joint [rad/s], or of the tool [m/s].
+        acceleration: Likewise [rad/s^2, m/s^2].
+    """
+
+    name: str
+    kind: Literal["joint", "line"]
+    pose: Floats
+    joints: Floats
+    speed: float
+    acceleration: float
+
+
+def tool_offset(cell: Cell) -> tuple[float, ...]:
+    """(6,) the finger tips in the flange's frame, as `set_tcp` takes it."""
+    return (*cell.jaws.flange_from_tip[:3, 3].tolist(), 0.0, 0.0, 0.0)
+
+
+def controller_pose(joints: Floats, cell: Cell, chain: Chain | None = None) -> Floats:
+    """(6,) pose of the finger tips in the controller's base frame, for joint angles (6,) [rad]."""
+    tip = CONTROLLER_FROM_BASE @ (chain or ur5_chain()).forward(joints) @ cell.jaws.flange_from_tip
+    return np.concatenate([tip[:3, 3], Rotation.from_matrix(tip[:3, :3]).as_rotvec()])
+
+
+def controller_move(motion: Motion, cell: Cell) -> Move:
+    """A motion with the largest speed and acceleration that were planned for it.
+
+    Raises:
+        StackgenError: If it leaves the cell's workspace, or is faster than the cell allows.
+    """
+    times = np.linspace(0, motion.duration, _SAMPLES)
+    positions, velocities = motion.at(times)
+    check_workspace(motion.name, positions, cell)
+    if motion.kind == "joint":
+        rates = np.abs(velocities).max(axis=1)
+        limits, unit = np.radians([cell.speeds.joint, cell.speeds.joint_acceleration]), "rad"
+    else:
+        tool = np.array([ur5_chain().jacobian(q)[:3] @ v for q, v in zip(positions, velocities, strict=True)])
+        rates = np.linalg.norm(tool, axis=1)
+        limits, unit = np.array([cell.speeds.line, cell.speeds.line_acceleration]), "m"
+    speed, acceleration = float(rates.max()), float(np.abs(np.diff(rates) / np.diff(times)).max())
+    if speed > limits[0] * 1.01 or acceleration > limits[1] * 1.01:
+        raise StackgenError(
+            f"{motion.name} would be too fast: {speed:.2f} {unit}/s and {acceleration:.2f} {unit}/s^2, cell.speeds"
+            f" allows {limits[0]:.2f} and {limits[1]:.2f}"
+        )
+    end = motion.end
+    return Move(
+        motion.name,
+        motion.kind,
+        controller_pose(end, cell),
+        end,
+        float(np.clip(speed, _SLOWEST, limits[0])),
+        float(np.clip(acceleration, _SLOWEST, limits[1])),
+    )
+
+
+def check_workspace(name: str, positions: Floats, cell: Cell) -> None:
+    """See that the finger tips stay in the workspace at joint angles (T, 6) [rad].
+
+    Raises:
+        StackgenError: If they do not.
+    """
+    low, high = np.array(cell.workspace.low) - _SLACK, np.array(cell.workspace.high) + _SLACK
+    for joints in positions:
+        tip = cell.tip_in_table(ur5_chain().forward(joints))[:3, 3]
+        if (tip < low).any() or (tip > high).any():
+            x, y, z = tip
+            raise StackgenError(
+                f"{name} would bring the finger tips to ({x:.3f}, {y:.3f}, {z:.3f}) m, outside cell.workspace"
+            )
+
+
+class Grasps:
+    """Tells the closing that takes a block from those that only make a pusher of the jaws: it is the last one."""
+
+    def __init__(self) -> None:
+        self._left = 0
+
+    def begin(self, step: BlockPlan) -> None:
+        """A block is begun."""
+        self._left = sum(isinstance(action, Close) for action in step.actions)
+
+    def is_grasp(self) -> bool:
+        """Whether the jaws that close now take the block."""
+        self._left -= 1
+        return self._left == 0

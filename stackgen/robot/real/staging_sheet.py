@@ -1,0 +1,221 @@
+"""A sheet to lay the blocks out on: their outlines to scale, seen from above, in numbered slots.
+
+A PDF has an overview and pages of A4 to be printed at 100 % and joined at the marks of the table's coordinates; an
+SVG is one drawing of the whole area for a plotter. Lengths in millimetres.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
+
+from stackgen.errors import StackgenError
+from stackgen.io.files import write_atomically
+from stackgen.robot.planning.staging import Waiting, lay_out
+from stackgen.robot.workcell import Cell, pose
+from stackgen.stack import Stack
+from stackgen.world import Shape
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Floats = NDArray[np.float64]
+
+PAGE = (210.0, 297.0)  # A4
+MARGIN = 12.0  # of a page, which printers leave white
+_INCH = 25.4
+_MARKS = 50.0  # between the crosses of the table's coordinates
+_SKETCH = 0.3  # scale of the front view beside an outline
+SUFFIXES = (".pdf", ".svg")
+
+
+@dataclass(frozen=True)
+class Place:
+    """A block in its slot, on paper.
+
+    Args:
+        slot: Its number, from 1.
+        block: Its number in the stack.
+        shape: Its name.
+        border: (4, 2) of the slot.
+        outline: (V, 2) of the block as it lies, seen from above.
+        front: (V, 2) of the block as it lies, seen from the front of its slot, around the origin.
+    """
+
+    slot: int
+    block: int
+    shape: str
+    border: Floats
+    outline: Floats
+    front: Floats
+
+
+def places(stack: Stack, order: tuple[int, ...], cell: Cell, cell_size: float) -> list[Place]:
+    """Where the blocks lie, in the order in which they are fetched.
+
+    Raises:
+        StackgenError: If they do not fit into the staging area.
+    """
+    waiting = lay_out(stack, order, cell, cell_size)
+    return [
+        _place(number, block, waiting[block], stack.catalogue[int(stack.shapes[block])], cell, cell_size)
+        for number, block in enumerate(order, 1)
+    ]
+
+
+def _place(number: int, block: int, waiting: Waiting, shape: Shape, cell: Cell, cell_size: float) -> Place:
+    corners = shape.vertices * cell_size @ waiting.frame[:3, :3].T + waiting.frame[:3, 3]
+    x, y, turn = cell.staging.slots[number - 1]
+    slot = pose((x, y, 0.0), turn)
+    half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [cell.staging.length / 2, cell.staging.depth / 2]
+    border = half @ slot[:2, :2].T + [x, y]
+    in_slot = (corners - slot[:3, 3]) @ slot[:3, :3]
+    front = _hull(in_slot[:, [0, 2]])
+    middle = (front.min(axis=0) + front.max(axis=0)) / 2
+    return Place(number, block, shape.name, border * 1e3, _hull(corners[:, :2]) * 1e3, (front - middle) * 1e3)
+
+
+def write_staging_sheet(path: Path, stack: Stack, order: tuple[int, ...], cell: Cell, cell_size: float) -> None:
+    """Write the sheet.
+
+    Args:
+        path: A .pdf or an .svg.
+        stack: What is built.
+        order: In which its blocks are fetched.
+        cell: With the slots.
+        cell_size: Edge of a cube [m].
+
+    Raises:
+        StackgenError: If the suffix is another, the blocks do not fit, or the file cannot be written.
+    """
+    check_suffix(path)
+    found = places(stack, order, cell, cell_size)
+    write_atomically(path, _svg(found, cell) if path.suffix.lower() == ".svg" else _pdf(found, cell))
+
+
+def check_suffix(path: Path) -> None:
+    """See that a sheet can be written under this name.
+
+    Raises:
+        StackgenError: If not.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise StackgenError(f"--staging_sheet {path}: sheets are written as {' or '.join(SUFFIXES)}; change the suffix")
+
+
+def area(found: list[Place]) -> tuple[Floats, Floats]:
+    """Corners of the rectangle around slots and structure."""
+    points = np.concatenate([place.border for place in found] + [np.array([[-20.0, -20.0], [20.0, 20.0]])])
+    return points.min(axis=0), points.max(axis=0)
+
+
+def tiles(found: list[Place]) -> Iterator[tuple[Floats, tuple[int, int]]]:
+    """Lower left corner of each page with something on it, and its row (from below) and column, from 1."""
+    low, high = area(found)
+    size = np.array(PAGE) - 2 * MARGIN
+    columns, rows = np.ceil((high - low) / size).astype(int)
+    drawn = [np.concatenate([place.border, place.outline]) for place in found] + [np.zeros((1, 2))]
+    for row in range(rows):
+        for column in range(columns):
+            corner = low + size * [column, row]
+            if any((p.max(axis=0) > corner).all() and (p.min(axis=0) < corner + size).all() for p in drawn):
+                yield corner, (row + 1, column + 1)
+
+
+def _pdf(found: list[Place], cell: Cell) -> bytes:
+    from matplotlib.backends.backend_pdf import PdfPages
+
+    data = io.BytesIO()
+    size = np.array(PAGE) - 2 * MARGIN
+    with PdfPages(data, metadata={"Title": "stackgen staging sheet", "CreationDate": None}) as pages:
+        low, high = area(found)
+        _page(pages.savefig, PAGE[::-1], (low - 30, high + 30), found, cell, "Overview (not to scale)", True)
+        for corner, (row, column) in tiles(found):
+            title = f"Row {row} from below, column {column} from the left: print at 100 %, cut along the frame"
+            _page(pages.savefig, PAGE, (corner, corner + size), found, cell, title, False)
+    return data.getvalue()
+
+
+def _svg(found: list[Place], cell: Cell) -> bytes:
+    data = io.BytesIO()
+    low, high = area(found)
+    size = tuple(high - low + 2 * MARGIN)
+
+    def save(figure: Figure) -> None:
+        figure.savefig(data, format="svg", metadata={"Date": None})
+
+    _page(save, (float(size[0]), float(size[1])), (low, high), found, cell, "Plot at 100 %", False)
+    return data.getvalue()
+
+
+def _page(
+    save: Callable[[Figure], Any],
+    page: tuple[float, float],
+    window: tuple[Floats, Floats],
+    found: list[Place],
+    cell: Cell,
+    title: str,
+    overview: bool,
+) -> None:
+    """One page that shows a window of the table; 1 mm is 1 mm unless it is the overview."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(page[0] / _INCH, page[1] / _INCH))
+    box = (MARGIN / page[0], MARGIN / page[1], 1 - 2 * MARGIN / page[0], 1 - 2 * MARGIN / page[1])
+    axes = figure.add_axes(box)
+    (left, bottom), (right, top) = window
+    axes.set(xlim=(left, right), ylim=(bottom, top), xticks=[], yticks=[])
+    if overview:
+        axes.set_aspect("equal")
+    for place in found:
+        _draw(axes, place, 6 if overview else 11)
+    _marks(axes, window, overview)
+    x, y, _ = (1e3 * number for number in cell.base.position)
+    axes.plot([x], [y], "o", color="black", markersize=8)
+    axes.annotate("arm", (x, y), (6, 6), textcoords="offset points", fontsize=7, annotation_clip=True)
+    axes.plot([0], [0], "+", color="black", markersize=18)
+    axes.annotate("middle of the structure", (0, 0), (6, 9), textcoords="offset points", fontsize=7)
+    figure.text(0.5, 1 - MARGIN / page[1] / 2, title, ha="center", va="center", fontsize=9)
+    note = "seen from above; the camera is below, the arm above; small: the block as seen from the front of its slot"
+    figure.text(0.5, MARGIN / page[1] / 2, note, ha="center", va="center", fontsize=7)
+    save(figure)
+
+
+def _draw(axes: Axes, place: Place, font: float) -> None:
+    from matplotlib.patches import Polygon
+
+    axes.add_patch(Polygon(place.border, closed=True, fill=False, linestyle=":", linewidth=0.5))
+    axes.add_patch(Polygon(place.outline, closed=True, facecolor="0.93", edgecolor="black", linewidth=1.0))
+    middle = (place.outline.min(axis=0) + place.outline.max(axis=0)) / 2
+    axes.text(middle[0], middle[1], f"{place.slot}", ha="center", va="center", fontsize=2 * font, clip_on=True)
+    corner = place.border.min(axis=0)
+    text = f"slot {place.slot}: block {place.block}, {place.shape}"
+    axes.text(corner[0] + 3, corner[1] + 3, text, va="bottom", fontsize=0.7 * font, clip_on=True)
+    sketch = place.front * _SKETCH
+    at = np.array([place.border[:, 0].min(), place.border[:, 1].max()])
+    sketch = sketch - [sketch[:, 0].min(), sketch[:, 1].max()] + at + [3, -3]
+    axes.add_patch(Polygon(sketch, closed=True, fill=False, linewidth=0.8))
+
+
+def _marks(axes: Axes, window: tuple[Floats, Floats], overview: bool) -> None:
+    """Crosses of the table's coordinates, to join pages and to check the scale with a ruler."""
+    low, high = window
+    step = 2 * _MARKS if overview else _MARKS
+    xs, ys = (np.arange(np.ceil(a / step), b / step + 1e-9) * step for a, b in zip(low, high, strict=True))
+    grid = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+    axes.plot(*grid.T, "+", color="0.4", markersize=6, markeredgewidth=0.4)
+    for x, y in grid[(grid % (2 * _MARKS) == 0).all(axis=1)]:
+        axes.annotate(f"{x:.0f}, {y:.0f}", (x, y), (2, 2), textcoords="offset points", fontsize=4, color="0.4")
+
+
+def _hull(points: Floats) -> Floats:
+    """Corners (V, 2) of the convex hull, anticlockwise."""
+    return np.asarray(points[ConvexHull(points).vertices])

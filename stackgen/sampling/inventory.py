@@ -1,0 +1,153 @@
+"""Build it with what is on the table: the block lists that an inventory allows.
+
+An inventory is a number of blocks of each shape, more than one structure needs or fewer. Which of the lists
+it allows can make a silhouette is searched; the network says which of them is the most likely.
+
+Legend: S shapes, H x W pixels, T block lists.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stackgen.errors import StackgenError
+from stackgen.protocols import BlockListPredictor
+from stackgen.sampling.feasible import lists_that_make
+from stackgen.stack import format_block_list, parse_block_list
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
+
+Inventory = str | Mapping[str, int] | NDArray[np.int64]
+"""`"cube=4,rectangle=3"`, `{"cube": 4, "rectangle": 3}` or counts (S,) in catalogue order."""
+
+MOST = 10**6
+"""Blocks of an inventory, at most."""
+
+_RANKED = 64  # lists that the network is asked for; what can be made but is not among them comes after
+_SLACK = 0.5  # area that a silhouette may be larger than its blocks [cell]: displacement, gaps, whole pixels
+
+
+def inventory_counts(inventory: Inventory, catalogue: Catalogue = PAPER_CATALOGUE) -> NDArray[np.int64]:
+    """(S,) counts of an inventory in any of its forms.
+
+    Raises:
+        StackgenError: On an unknown shape, a negative number, or no block at all.
+
+    >>> inventory_counts("cube=40, triangle=1").tolist()
+    [40, 0, 0, 1]
+    """
+    try:
+        if isinstance(inventory, str):
+            return parse_block_list(inventory, catalogue, MOST)
+        if isinstance(inventory, Mapping):
+            counts = np.zeros(len(catalogue), dtype=np.int64)
+            for name, number in inventory.items():
+                counts[catalogue.index(name)] = number
+        else:
+            counts = np.asarray(inventory, dtype=np.int64)
+    except StackgenError as error:
+        raise StackgenError(str(error).replace("block list", "inventory", 1)) from error
+    if counts.shape != (len(catalogue),) or (counts < 0).any() or not 1 <= counts.sum() <= MOST:
+        names = ", ".join(catalogue.names)
+        raise StackgenError(f"inventory: at least one block in all, 0 or more of each of {names}, got {inventory!r}")
+    return counts
+
+
+def allowed_lists(
+    silhouette: Mask,
+    inventory: NDArray[np.int64],
+    predictor: Callable[[], BlockListPredictor] | None = None,
+    top: int = 1,
+    catalogue: Catalogue = PAPER_CATALOGUE,
+    grid: Grid = PAPER_GRID,
+    max_blocks: int = MAX_BLOCKS,
+) -> NDArray[np.int64]:
+    """The block lists that an inventory allows and that can make a silhouette, the most likely first.
+
+    Lists that the network does not know come after those it does, few blocks first. A silhouette that
+    no blocks fill row by row, such as a drawing between the lines, is left to the network alone.
+
+    Args:
+        silhouette: (H, W), on the cells of the grid.
+        inventory: (S,) counts.
+        predictor: Makes what ranks lists; None for a model without.
+        top: How many lists, at most.
+        catalogue, grid: The world.
+        max_blocks: Of one stack.
+
+    Returns:
+        (T, S), at least one.
+
+    Raises:
+        StackgenError: If the inventory cannot make the silhouette; the message says what is missing.
+    """
+    limit = np.minimum(inventory, max_blocks)
+    _check_area(silhouette, inventory, catalogue, grid, max_blocks)
+    fitting = _fitting(silhouette, limit, catalogue, grid, max_blocks)
+    if not fitting and fitting is not None:
+        others = _fitting(silhouette, np.full(len(catalogue), max_blocks), catalogue, grid, max_blocks)
+        if others:
+            raise StackgenError(_what_is_missing(inventory, others, catalogue))
+    if predictor is None:
+        if not fitting:
+            raise StackgenError("this model predicts no block lists, and none was found for this silhouette: give one")
+        return np.array(_fewest_first(fitting)[:top])
+    ranked = [tuple(counts) for counts in predictor().predict(silhouette[None], _RANKED, limit)[0].tolist()]
+    if not fitting:
+        return np.array(ranked[:top])
+    known = [counts for counts in ranked if counts in fitting]
+    return np.array([*known, *_fewest_first(fitting - set(known))][:top])
+
+
+def _fitting(
+    silhouette: Mask, limit: NDArray[np.int64], catalogue: Catalogue, grid: Grid, max_blocks: int
+) -> set[tuple[int, ...]] | None:
+    """Block lists that can make the silhouette; None where that cannot be told for these shapes."""
+    try:
+        found = lists_that_make(silhouette, limit, catalogue, grid)
+    except StackgenError:
+        return None
+    return {counts for counts in found if sum(counts) <= max_blocks}
+
+
+def _fewest_first(lists: set[tuple[int, ...]]) -> list[tuple[int, ...]]:
+    return sorted(lists, key=lambda counts: (sum(counts), counts))
+
+
+def _check_area(
+    silhouette: Mask, inventory: NDArray[np.int64], catalogue: Catalogue, grid: Grid, max_blocks: int
+) -> None:
+    """Raise StackgenError if all the blocks together cannot cover the silhouette."""
+    wanted = float(np.count_nonzero(silhouette)) / grid.pixels_per_cell**2
+    areas = np.repeat([shape.area for shape in catalogue], np.minimum(inventory, max_blocks))
+    largest = float(np.sort(areas)[::-1][:max_blocks].sum())
+    if wanted - largest <= _SLACK:
+        return
+    given = format_block_list(inventory, catalogue)
+    rest = f", of which one stack takes {max_blocks} blocks at most" if inventory.sum() > max_blocks else ""
+    raise StackgenError(
+        f"the inventory {given} is too small: the silhouette covers {wanted:.1f} cells, its blocks"
+        f" {largest:.1f}{rest}; {wanted - largest:.1f} cells are missing"
+    )
+
+
+def _what_is_missing(inventory: NDArray[np.int64], lists: set[tuple[int, ...]], catalogue: Catalogue) -> str:
+    """One line about the list that lacks the least."""
+
+    def lacking(counts: tuple[int, ...]) -> NDArray[np.int64]:
+        return np.maximum(np.array(counts) - inventory, 0)
+
+    nearest = min(lists, key=lambda counts: (lacking(counts).sum(), sum(counts), counts))
+    always = np.min([lacking(counts) for counts in lists], axis=0)
+    reason = "it has no blocks that fill all its rows"
+    tapering = [name for name, n, shape in zip(catalogue.names, always, catalogue, strict=True)
+                if n and not shape.level[1]]  # fmt: skip
+    if tapering:
+        reason = f"its slanted cells need a {' and a '.join(tapering)} each"
+    return (
+        f"the inventory {format_block_list(inventory, catalogue)} cannot make this silhouette: {reason};"
+        f" with {format_block_list(lacking(nearest), catalogue)} more it could be"
+        f" {format_block_list(nearest, catalogue)}"
+    )

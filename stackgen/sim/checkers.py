@@ -1,0 +1,73 @@
+"""Two questions to one rollout: may it be data (accept), and did a block fall (fell)?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stackgen.geometry import tilt
+from stackgen.protocols import Verdict
+from stackgen.sim.physics import Physics
+from stackgen.sim.simulator import Rollout, Simulator
+from stackgen.stack import Stack
+from stackgen.world import PAPER_CATALOGUE, Catalogue
+
+
+@dataclass(frozen=True)
+class AcceptLimits:
+    """How far a stack may settle and still be called the stack that was put down.
+
+    Args:
+        displacement: Of any block's centre along any axis [cell].
+        tilt: Of any block away from the vertical it started with [rad].
+    """
+
+    displacement: float = 0.2
+    tilt: float = 0.1
+
+
+def accept(rollout: Rollout, limits: AcceptLimits) -> bool:
+    """Whether a rollout makes its settled stack good enough to be data: at rest, near where it began, upright."""
+    moved = np.abs(rollout.end.poses[:, :3] - rollout.start.poses[:, :3]).max(initial=0)
+    leaned = np.abs(tilt(rollout.end.poses) - tilt(rollout.start.poses)).max(initial=0)
+    return bool(rollout.at_rest and moved <= limits.displacement and leaned <= limits.tilt)
+
+
+def fell(rollout: Rollout, physics: Physics) -> NDArray[np.bool_]:
+    """(k,) which blocks fell to a layer below where they began (paper, "Evaluation in simulation")."""
+    return rollout.drop > physics.fall_height
+
+
+class SimulatorChecker:
+    """A StabilityChecker that asks PyBullet.
+
+    Args:
+        physics: Its numbers; the project's own by default.
+        catalogue: The shapes of the stacks to come.
+        until_fall: End a rollout at the first fall: the same verdicts, sooner; but the settled
+            poses of unstable stacks are then those of that moment.
+    """
+
+    def __init__(
+        self, physics: Physics | None = None, catalogue: Catalogue = PAPER_CATALOGUE, until_fall: bool = False
+    ) -> None:
+        self.simulator = Simulator(physics, catalogue)
+        self.until_fall = until_fall
+
+    @property
+    def physics(self) -> Physics:
+        """The numbers its verdicts hold for."""
+        return self.simulator.physics
+
+    def check(self, stack: Stack) -> Verdict:
+        """Judge one stack."""
+        rollout = self.simulator.rollout(stack, until_fall=self.until_fall)
+        fallen = fell(rollout, self.physics)
+        return Verdict(not fallen.any(), fallen, rollout.drop, rollout.end, rollout.at_rest)
+
+    def check_all(self, stacks: Iterable[Stack]) -> list[Verdict]:
+        """Judge many."""
+        return [self.check(stack) for stack in stacks]

@@ -1,0 +1,350 @@
+"""Callbacks that every module shares: averaged and compiled weights, quality of samples, throughput."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from stackgen._lightning import pl
+from stackgen.data.loading.arrays import Batch
+from stackgen.errors import StackgenError
+from stackgen.evaluation.metrics import SCENE_METRICS, SceneMetric, SceneScore
+from stackgen.evaluation.protocol import Scene, batch_seed, judge, scenes_of_batch
+from stackgen.protocols import StabilityChecker, StackSampler, Verdict
+from stackgen.stack import Stack
+from stackgen.training.plots import log_picture, silhouette_sheet
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Grid
+
+Part = tuple[float, float]
+"""A sum, and the weight that it is to be divided by."""
+
+RAW_WEIGHTS = "raw_state_dict"
+"""Key of the not averaged weights in a checkpoint; its `state_dict` holds the averaged ones."""
+
+
+class StartFrom(pl.Callback):
+    """Start training from other weights, to fine-tune them; list it before EMA.
+
+    Args:
+        weights: A name, a `.safetensors` file or a `.ckpt` of the same architecture; parts that it lacks
+            (such as an embedding that was added since) begin as they would without it.
+    """
+
+    def __init__(self, weights: str) -> None:
+        self.weights = weights
+
+    def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Load them, unless the fit resumes from a checkpoint of its own."""
+        if trainer.ckpt_path:
+            return
+        from stackgen.models.weights import (
+            read_weights,  # it stands above the models, as this file does not
+            resolve_weights,
+        )
+
+        tensors, _ = read_weights(resolve_weights(self.weights))
+        try:
+            missing, foreign = pl_module.model.load_state_dict(tensors, strict=False)  # type: ignore[union-attr]
+        except RuntimeError as error:
+            raise StackgenError(f"StartFrom: {self.weights} does not fit the model of the configuration") from error
+        if foreign or len(missing) > len(tensors) // 2:
+            raise StackgenError(f"StartFrom: {self.weights} does not fit the model of the configuration")
+        if missing:
+            print(f"StartFrom: {self.weights} has no {', '.join(missing)}: begun afresh")
+
+
+class Compile(pl.Callback):
+    """Compiles parts of the network with torch.compile for the training steps, in place: weights keep their names.
+
+    Validation and sampling see other sizes and modes, each a compilation of its own; they run as written.
+
+    Args:
+        parts: Of the training module, by their names in it.
+        backend: Of torch.compile; `inductor` asks for a C++ compiler on a CPU.
+        mode: Of that backend, such as `reduce-overhead` or `max-autotune`.
+        dynamic: Whether one compilation is for all sizes; null compiles for the first size, and for all at the second.
+    """
+
+    def __init__(
+        self,
+        parts: Sequence[str] = ("model.denoiser",),
+        backend: str = "inductor",
+        mode: str | None = None,
+        dynamic: bool | None = None,
+    ) -> None:
+        self.parts = tuple(parts)
+        self.options: dict[str, Any] = {"backend": backend, "mode": mode, "dynamic": dynamic}
+
+    def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Mark them; each is compiled when it is first called."""
+        known = dict(pl_module.named_modules())
+        for part in self.parts:
+            if part not in known:
+                kin = [name for name in known if name and name.count(".") < 2]
+                raise StackgenError(f"Compile: {type(pl_module).__name__} has no part {part!r}; try {', '.join(kin)}")
+            known[part].compile(**self.options)
+
+    def on_validation_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Run as written."""
+        torch.compiler.set_stance("force_eager")
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Run what is compiled."""
+        torch.compiler.set_stance("default")
+
+    def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
+        """Leave nothing behind for what runs next in this process."""
+        torch.compiler.set_stance("default")
+
+
+class EMA(pl.Callback):
+    """Exponential moving average of the weights, used for everything but the training steps.
+
+    After update t the average is a + (1 - d) (w - a) with d = min(decay, (1 + t) / (10 + t)) (the
+    second term lets a young average forget its random beginning). Validation, test and prediction
+    run with the average, checkpoints hold it as their `state_dict` (the weights in training beside
+    it, to resume from), and when the fit ends it stays in the module. Checkpoints of weights alone
+    (`save_weights_only`) reach no callback and hold the weights in training.
+
+    Args:
+        decay: Share of the old average that an update keeps.
+        warmup: Whether a young average keeps less.
+    """
+
+    def __init__(self, decay: float = 0.999, warmup: bool = True) -> None:
+        if not 0 <= decay < 1:
+            raise StackgenError(f"EMA: decay must lie in [0, 1), got {decay}")
+        self.decay, self.warmup = decay, warmup
+        self.updates = 0
+        self._names: list[str] = []
+        self._live: list[Tensor] = []  # the module's own tensors
+        self._other: list[Tensor] = []  # the average; while swapped, the weights in training
+        self._swapped = False
+        self._step = 0
+        self._raw: dict[str, Tensor] | None = None  # of the checkpoint that is being resumed
+
+    def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Begin with the weights as they are: fresh, or averaged ones of a checkpoint."""
+        state = {n: t for n, t in pl_module.state_dict().items() if t.is_floating_point()}
+        self._names, self._live = list(state), list(state.values())
+        self._other = [tensor.clone() for tensor in self._live]
+        self._swapped = False
+        if self._raw is not None:
+            with torch.no_grad():
+                torch._foreach_copy_(self._live, [self._raw[name].to(t) for name, t in state.items()])
+            self._raw = None
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Remember where the steps are."""
+        self._step = trainer.global_step
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Update after each optimiser step, not after each batch that only accumulates gradients."""
+        if trainer.global_step == self._step:
+            return
+        self._step = trainer.global_step
+        keep = min(self.decay, (1 + self.updates) / (10 + self.updates)) if self.warmup else self.decay
+        with torch.no_grad():
+            torch._foreach_lerp_(self._other, self._live, 1 - keep)
+        self.updates += 1
+
+    def _swap(self, averaged: bool) -> None:
+        """Exchange the module's weights and the others, unless they are as asked for."""
+        if averaged != self._swapped and self._live:
+            with torch.no_grad():
+                live = [tensor.clone() for tensor in self._live]
+                torch._foreach_copy_(self._live, self._other)
+                torch._foreach_copy_(self._other, live)
+            self._swapped = averaged
+
+    def on_validation_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Validate with the average."""
+        self._swap(averaged=True)
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Train on."""
+        if trainer.state.fn == "fit":
+            self._swap(averaged=False)
+
+    def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Leave the average in the module: what is tested, exported or used next."""
+        self._swap(averaged=True)
+
+    def on_save_checkpoint(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """The average as the checkpoint's weights, those in training beside them."""
+        if not self._live:
+            return
+        average, raw = (self._live, self._other) if self._swapped else (self._other, self._live)
+        checkpoint[RAW_WEIGHTS] = dict(zip(self._names, raw, strict=True))
+        checkpoint["state_dict"] = {**checkpoint["state_dict"], **dict(zip(self._names, average, strict=True))}
+
+    def on_load_checkpoint(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Keep the weights in training for :meth:`on_fit_start`; the module loads the average itself."""
+        self._raw = checkpoint.get(RAW_WEIGHTS)
+
+    def state_dict(self) -> dict[str, Any]:
+        """How many updates the average has seen."""
+        return {"updates": self.updates}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Inverse of :meth:`state_dict`."""
+        self.updates = int(state_dict["updates"])
+
+
+class SampleQuality(pl.Callback):
+    """Every few epochs, and when only validating, samples validation scenes with their true lists and scores them.
+
+    The module's `sampler()` gives the StackSampler; metrics are logged as `sample/<name>`, a picture of some
+    scenes as `sample/scenes`. Without a checker only what needs no physics is logged; whoever builds the
+    trainer may set `checker`, and the command line does.
+
+    Args:
+        every_n_epochs: 0 never samples.
+        num_scenes: The first of the validation split, over all processes.
+        num_samples: Stacks per scene.
+        seed: The same noise each time, so that epochs compare.
+        checker: The physics.
+        num_pictures: Scenes in the picture; 0 draws none.
+    """
+
+    def __init__(
+        self,
+        every_n_epochs: int = 5,
+        num_scenes: int = 64,
+        num_samples: int = 1,
+        seed: int = 0,
+        checker: StabilityChecker | None = None,
+        num_pictures: int = 8,
+    ) -> None:
+        if every_n_epochs < 0 or num_scenes < 1 or num_samples < 1 or num_pictures < 0:
+            raise StackgenError(
+                "SampleQuality: num_scenes and num_samples must be at least 1,"
+                " every_n_epochs and num_pictures 0 or more"
+            )
+        self.every_n_epochs, self.num_scenes, self.num_samples = every_n_epochs, num_scenes, num_samples
+        self.seed, self.checker, self.num_pictures = seed, checker, num_pictures
+        self._batches: list[Batch] = []
+
+    def _due(self, trainer: pl.Trainer) -> bool:
+        fitting = trainer.state.fn == "fit"
+        due = not fitting or (self.every_n_epochs > 0 and (trainer.current_epoch + 1) % self.every_n_epochs == 0)
+        return due and not trainer.sanity_checking
+
+    def on_validation_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Begin to collect scenes."""
+        self._batches = []
+
+    def on_validation_batch_end(
+        self,
+        trainer: pl.Trainer,
+        pl_module: pl.LightningModule,
+        outputs: Any,
+        batch: Batch,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Collect scenes until there are enough."""
+        missing = -(-self.num_scenes // trainer.world_size) - sum(len(b["mask"]) for b in self._batches)
+        if missing > 0 and self._due(trainer):
+            self._batches.append({name: tensor[:missing] for name, tensor in batch.items()})
+
+    def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Sample, judge and log; the averaged weights are in the module now."""
+        if not self._batches:
+            return
+        make_sampler: Any = pl_module.sampler  # of our modules; Lightning knows nothing of it
+        sampler: StackSampler = make_sampler()
+        catalogue = getattr(sampler, "catalogue", PAPER_CATALOGUE)
+        scenes = [scene for batch in self._batches for scene in scenes_of_batch(batch, catalogue)]
+        self._batches = []
+        start = time.perf_counter()
+        stacks = self.draw(sampler, scenes, trainer.global_rank)
+        rate = len(scenes) * self.num_samples, time.perf_counter() - start
+        parts = {**self.measure(sampler, scenes, stacks), "stacks_per_second": rate}
+        values = _over_processes(trainer, parts)  # the same on all of them
+        pl_module.log_dict({f"sample/{name}": value for name, value in values.items()}, sync_dist=True)
+        if self.num_pictures and trainer.is_global_zero:
+            firsts, shown = scenes[: self.num_pictures], [samples[0] for samples in stacks[: self.num_pictures]]
+            verdicts = [self.checker.check(stack) if self.checker else None for stack in shown]
+            log_picture(trainer, "sample/scenes", silhouette_sheet(firsts, shown, verdicts, _grid(sampler)))
+
+    def draw(self, sampler: StackSampler, scenes: list[Scene], rank: int = 0) -> list[list[Stack]]:
+        """Stacks for some scenes, the same for the same weights."""
+        silhouettes, counts = np.stack([s.silhouette for s in scenes]), np.stack([s.counts for s in scenes])
+        return sampler.sample_batch(silhouettes, counts, self.num_samples, batch_seed(self.seed, 0, rank))
+
+    def measure(self, sampler: StackSampler, scenes: list[Scene], stacks: list[list[Stack]]) -> dict[str, Part]:
+        """The figures of some scenes, by name, each as a sum and the weight that it is to be divided by."""
+        scores = [r.score for r in judge(scenes, stacks, self.checker or _NoPhysics(), _grid(sampler))]
+        names = SCENE_METRICS if self.checker else ("diversity", "front_iou_before_physics")
+        return {name: _sum(SCENE_METRICS[name], scores) for name in names}
+
+
+def _grid(sampler: StackSampler) -> Grid:
+    return getattr(sampler, "grid", PAPER_GRID)
+
+
+class _NoPhysics:
+    """Stands in for a checker where there is none: nothing moves. For figures that ignore physics."""
+
+    def check(self, stack: Stack) -> Verdict:
+        return Verdict(True, np.zeros(len(stack), bool), np.zeros(len(stack)), stack)
+
+
+def _sum(metric: SceneMetric, scores: list[SceneScore]) -> Part:
+    totals, weights = zip(*(metric(score) for score in scores), strict=True)
+    return sum(totals), sum(weights)
+
+
+def _over_processes(trainer: pl.Trainer, parts: dict[str, Part]) -> dict[str, float]:
+    """The mean of each figure, all processes' scenes counting alike; NaN where it does not exist."""
+    local = torch.tensor(list(parts.values()), device=trainer.strategy.root_device)
+    sums = trainer.strategy.reduce(local, reduce_op="sum").tolist()
+    return {name: total / weight if weight else float("nan") for name, (total, weight) in zip(parts, sums, strict=True)}
+
+
+class Throughput(pl.Callback):
+    """Logs `train/samples_per_second` over all processes, of training steps and their data alone.
+
+    Args:
+        every_n_steps: Batches averaged over.
+    """
+
+    def __init__(self, every_n_steps: int = 50) -> None:
+        if every_n_steps < 1:
+            raise StackgenError(f"Throughput: every_n_steps must be at least 1, got {every_n_steps}")
+        self.every_n_steps = every_n_steps
+        self._restart()
+
+    def _restart(self) -> None:
+        self._samples, self._batches, self._since = 0, 0, time.perf_counter()
+
+    def on_train_epoch_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Leave out what happened between epochs."""
+        self._restart()
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Leave out the validation."""
+        self._restart()
+
+    def on_train_batch_end(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, outputs: Any, batch: Batch, batch_idx: int
+    ) -> None:
+        """Count, and log when there is enough to average."""
+        self._samples += len(batch["mask"])
+        self._batches += 1
+        if self._batches == self.every_n_steps:
+            rate = self._samples * trainer.world_size / (time.perf_counter() - self._since)
+            pl_module.log("train/samples_per_second", rate, batch_size=1)
+            self._restart()

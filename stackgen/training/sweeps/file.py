@@ -1,0 +1,119 @@
+"""The one format of a sweep: a W&B sweep file, read the same by `stackgen sweep` and by `wandb sweep`.
+
+https://docs.wandb.ai/guides/sweeps/define-sweep-configuration
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import yaml
+
+from stackgen.errors import StackgenError
+
+DEFAULT_COMMAND = ("${env}", "${interpreter}", "${program}", "${args}")
+"""What W&B runs where a file has no `command`."""
+
+
+@dataclass(frozen=True)
+class Metric:
+    """What a sweep is about.
+
+    Args:
+        name: As the program logs it.
+        goal: Which way is better.
+    """
+
+    name: str
+    goal: Literal["minimize", "maximize"] = "minimize"
+
+
+@dataclass(frozen=True)
+class EarlyTerminate:
+    """When a trial is given up: successive halving, as W&B's `hyperband` is (Li et al. 2018).
+
+    At the rungs min_iter, eta * min_iter, eta^2 * min_iter, ... only the best 1 / eta of the trials that came
+    so far go on.
+
+    Args:
+        type: Of the rule; W&B knows no other.
+        min_iter: First rung, in reports of the metric.
+        max_iter: Reports of a whole trial; with `s` instead of `min_iter`, the first rung is max_iter / eta^s.
+        s: Rungs below `max_iter`.
+        eta: Trials that come to a rung for each one that goes on.
+    """
+
+    type: Literal["hyperband"] = "hyperband"
+    min_iter: int | None = None
+    max_iter: int | None = None
+    s: int | None = None
+    eta: int = 3
+
+    @property
+    def first_rung(self) -> int:
+        """Reports before a trial can be given up."""
+        if self.min_iter is not None:
+            return self.min_iter
+        if self.max_iter is None or self.s is None:  # W&B takes no less
+            raise StackgenError("early_terminate: give min_iter, or max_iter and s")
+        return max(1, self.max_iter // self.eta**self.s)
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep file.
+
+    Args:
+        program: What every trial runs.
+        parameters: What is tried: for each name `value`, `values`, or `min` and `max` with a `distribution`.
+        metric: What is optimised.
+        method: `bayes` proposes by what was found so far (locally: TPE), `random` and `grid` do not.
+        command: How the program is called; `${program}`, `${interpreter}`, `${env}`, `${args}` and
+            `${args_no_hyphens}` are filled in.
+        early_terminate: When a trial is given up; never if left out.
+        run_cap: Trials in all; by default 30, of a grid all.
+        name: Of the sweep; its files go to runs/sweeps/NAME.
+        description: For people.
+        project: At W&B.
+        entity: At W&B.
+    """
+
+    program: str
+    parameters: dict[str, dict[str, Any]]
+    metric: Metric
+    method: Literal["bayes", "random", "grid"] = "bayes"
+    command: list[str] | None = None
+    early_terminate: EarlyTerminate | None = None
+    run_cap: int | None = None
+    name: str = "sweep"
+    description: str | None = None
+    project: str | None = None
+    entity: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.run_cap is not None and self.run_cap < 1:
+            raise StackgenError(f"--run_cap must be at least 1, got {self.run_cap}")
+        stop = self.early_terminate
+        if stop is not None and (stop.eta < 2 or stop.first_rung < 1):
+            raise StackgenError("early_terminate: eta must be at least 2 and min_iter at least 1")
+        if not self.parameters:
+            raise StackgenError("a sweep needs parameters, such as {model.draws: {values: [1, 2, 4]}}")
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain form, without what was left out: a W&B sweep file again."""
+        return _without_nulls(asdict(self))
+
+    def to_yaml(self) -> str:
+        """For `wandb sweep`."""
+        return yaml.safe_dump(self.to_json(), sort_keys=False)
+
+
+def _without_nulls(content: Mapping[str, Any]) -> dict[str, Any]:
+    """What was given, at the top and one level below; a parameter's value may be null and stays."""
+    kept = {name: value for name, value in content.items() if value is not None}
+    for name in ("metric", "early_terminate"):
+        if name in kept:
+            kept[name] = {key: value for key, value in kept[name].items() if value is not None}
+    return kept

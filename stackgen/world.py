@@ -1,0 +1,387 @@
+"""The world that a stack lives in: shapes, the grid and its pictures, and how many blocks there may be.
+
+Units: cells (the edge of a cube) for lengths, pixels for pictures.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from functools import cached_property
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stackgen.errors import StackgenError
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+View = Literal["front", "side", "top"]
+VIEWS: tuple[View, ...] = ("front", "side", "top")
+
+MAX_BLOCKS = 10
+"""N, the number of object tokens of the paper; the longest block list its models accept."""
+
+
+MOST_SHAPES = 127
+"""Shapes of a catalogue, at most: datasets count them in a signed byte."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A convex prism: an outline in the (x, z) plane extruded along y.
+
+    Args:
+        name: Word used in block lists, files and tables.
+        outline: Corners (x, z) [cell] in the block frame, counter-clockwise seen from the front;
+            the origin is the centre of the outline's box.
+        depth: Extent along y [cell].
+
+    Raises:
+        StackgenError: If the outline is not convex, not counter-clockwise or not centred.
+
+    >>> Shape("plank", ((-1, -0.25), (1, -0.25), (1, 0.25), (-1, 0.25))).size
+    (2.0, 1.0, 0.5)
+    """
+
+    name: str
+    outline: tuple[tuple[float, float], ...]
+    depth: float = 1.0
+
+    def __post_init__(self) -> None:
+        corners = np.asarray(self.outline, dtype=float)
+        if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
+            raise self._refused("must be at least three (x, z) corners, finite numbers")
+        edges = np.roll(corners, -1, axis=0) - corners
+        after = np.roll(edges, -1, axis=0)
+        turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
+        around = np.arctan2(turns, (edges * after).sum(axis=1)).sum()  # a star turns left too, but more than once
+        if np.abs(turns).max() <= 1e-9 * (edges**2).max():
+            raise self._refused("has no area; it must be convex and counter-clockwise")
+        if (turns < 0).all():
+            raise self._refused("must be convex and counter-clockwise; it is clockwise, so reverse its corners")
+        if (turns <= 0).any() or abs(around - 2 * np.pi) > 1e-6:
+            raise self._refused("must be convex and counter-clockwise, without a corner in the middle of an edge")
+        middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
+        if np.abs(middle).max() > 5e-7:
+            raise self._refused(f"must have its box centred on (0, 0); subtract ({middle[0]:g}, {middle[1]:g})")
+        if not 0 < self.depth < np.inf:
+            raise StackgenError(f"shape {self.name!r}: depth must be positive and finite, got {self.depth}")
+
+    def _refused(self, reason: str) -> StackgenError:
+        return StackgenError(f"shape {self.name!r}: the outline {reason}")
+
+    @cached_property
+    def size(self) -> tuple[float, float, float]:
+        """Extents of the box along x, y, z [cell]."""
+        corners = np.asarray(self.outline, dtype=float)
+        width, height = np.ptp(corners, axis=0)
+        return float(width), float(self.depth), float(height)
+
+    @cached_property
+    def _moments(self) -> tuple[float, Floats]:
+        """Area [cell^2] and centroid (x, z) [cell] of the outline, by the shoelace formula."""
+        a = np.asarray(self.outline, dtype=float)
+        b = np.roll(a, -1, axis=0)
+        cross = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
+        area = cross.sum() / 2
+        return float(area), ((a + b) * cross[:, None]).sum(axis=0) / (6 * area)
+
+    @property
+    def area(self) -> float:
+        """Area of the outline [cell^2]."""
+        return self._moments[0]
+
+    @property
+    def volume(self) -> float:
+        """Volume [cell^3]; mass is proportional to it."""
+        return self.area * self.depth
+
+    @property
+    def center_of_mass(self) -> Floats:
+        """(3,) centre of mass in the block frame [cell]."""
+        x, z = self._moments[1]
+        return np.array([x, 0.0, z])
+
+    @cached_property
+    def vertices(self) -> Floats:
+        """(2n, 3) corners of the prism in the block frame [cell], front face first."""
+        corners = np.asarray(self.outline, dtype=float)
+        front = np.insert(corners, 1, -self.depth / 2, axis=1)
+        return np.concatenate([front, front * [1, -1, 1]])
+
+    @cached_property
+    def is_box(self) -> bool:
+        """Whether the prism fills its box."""
+        width, depth, height = self.size
+        return abs(self.volume - width * depth * height) < 1e-9
+
+    @property
+    def level(self) -> tuple[bool, bool]:
+        """Whether there is a level edge at the bottom, to stand on, and at the top, to bear.
+
+        >>> PAPER_CATALOGUE[3].level
+        (True, False)
+        """
+        z = np.sort([corner[1] for corner in self.outline])
+        return bool(z[1] - z[0] < 1e-6), bool(z[-1] - z[-2] < 1e-6)
+
+    @staticmethod
+    def box(name: str, width: float, height: float = 1.0, depth: float = 1.0) -> Shape:
+        """A cuboid of the given extents [cell]."""
+        w, h = width / 2, height / 2
+        return Shape(name, ((-w, -h), (w, -h), (w, h), (-w, h)), depth)
+
+
+@dataclass(frozen=True)
+class Catalogue:
+    """The ordered shapes a world is made of; a shape's place in it is its index everywhere.
+
+    >>> PAPER_CATALOGUE.names
+    ('cube', 'rectangle', 'long_rectangle', 'triangle')
+    """
+
+    shapes: tuple[Shape, ...]
+
+    def __post_init__(self) -> None:
+        if not self.shapes or len(set(self.names)) != len(self.shapes):
+            raise StackgenError(f"a catalogue needs at least one shape and distinct names, got {list(self.names)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The shapes' names, in order."""
+        return tuple(shape.name for shape in self.shapes)
+
+    def __len__(self) -> int:
+        return len(self.shapes)
+
+    def __iter__(self) -> Iterator[Shape]:
+        return iter(self.shapes)
+
+    def __getitem__(self, index: int) -> Shape:
+        return self.shapes[index]
+
+    def index(self, name: str) -> int:
+        """Index of a shape by name.
+
+        Raises:
+            StackgenError: If there is no such shape.
+        """
+        if name not in self.names:
+            raise StackgenError(f"unknown shape {name!r}: the catalogue has {', '.join(self.names)}")
+        return self.names.index(name)
+
+    def to_json(self) -> list[dict]:
+        """Plain form for manifests, cards and `stacks.json`."""
+        return [
+            {"name": s.name, "outline": [[float(x), float(z)] for x, z in s.outline], "depth": float(s.depth)}
+            for s in self.shapes
+        ]
+
+    @staticmethod
+    def from_json(items: Sequence[Mapping]) -> Catalogue:
+        """Inverse of :meth:`to_json`.
+
+        Raises:
+            StackgenError: If an entry is malformed.
+        """
+        try:
+            return Catalogue(
+                tuple(
+                    Shape(
+                        str(i["name"]), tuple((float(x), float(z)) for x, z in i["outline"]), float(i.get("depth", 1))
+                    )
+                    for i in items
+                )
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise StackgenError(
+                f'a catalogue is a list of {{"name", "outline": [[x, z], ...], "depth"}}: {error!r}'
+            ) from error
+
+    @staticmethod
+    def from_config(items: Sequence[str | Mapping]) -> Catalogue:
+        """A catalogue as people write it: each entry the name of one of the paper's shapes, a box given by
+        `width` and, where they are not 1, `height` and `depth`, or a prism given by its `outline`.
+
+        Raises:
+            StackgenError: If an entry is none of these, or its name could not stand in a block list.
+
+        >>> Catalogue.from_config(["cube", {"name": "plank", "width": 2, "height": 0.5}]).names
+        ('cube', 'plank')
+        """
+        if isinstance(items, str | Mapping) or not isinstance(items, Sequence):
+            raise StackgenError(f"catalogue: it is a list of shapes, got {_short(items)}")
+        if len(items) > MOST_SHAPES:
+            raise StackgenError(f"catalogue: at most {MOST_SHAPES} shapes are possible, got {len(items)}")
+        return Catalogue(tuple(_shape_from_config(item) for item in items))
+
+
+def _shape_from_config(item: str | Mapping) -> Shape:
+    if isinstance(item, str):
+        return PAPER_CATALOGUE[PAPER_CATALOGUE.index(item)]
+    kind = {"outline"} if isinstance(item, Mapping) and "outline" in item else {"width", "height"}
+    if not isinstance(item, Mapping) or not {"name", max(kind)} <= set(item) <= {"name", "depth"} | kind:
+        raise StackgenError(
+            "catalogue: a shape is a name of the paper's, {name, width, height, depth} or {name, outline, depth},"
+            f" got {_short(item)}"
+        )
+    name = item["name"]
+    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w{0,99}", name, re.ASCII):
+        raise StackgenError(f"catalogue: a shape's name is letters, digits and _, from a letter on, got {_short(name)}")
+    try:
+        if "width" in item:
+            extents = [float(item.get(key, 1)) for key in ("width", "height", "depth")]
+            if not all(0 < extent < np.inf for extent in extents):
+                raise StackgenError(f"shape {name!r}: width, height and depth must be positive and finite")
+            return Shape.box(name, *extents)
+        return Shape(name, tuple((float(x), float(z)) for x, z in item["outline"]), float(item.get("depth", 1)))
+    except (TypeError, ValueError) as error:
+        raise StackgenError(f"shape {name!r}: extents are numbers, an outline [[x, z], ...]: {error}") from error
+
+
+def _short(value: object) -> str:
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else f"{text[:80]} ..."
+
+
+PAPER_CATALOGUE = Catalogue(
+    (
+        Shape.box("cube", 1),
+        Shape.box("rectangle", 2),
+        Shape.box("long_rectangle", 3),
+        Shape("triangle", ((-0.5, -0.5), (0.5, -0.5), (0.0, 0.5))),
+    )
+)
+"""The four shapes of the paper; SPEC: the long rectangle is three cells, the triangle one cell, apex up."""
+
+
+ROOM = 0.2
+"""Least space beside and above a full grid in its pictures [cell]: blocks are displaced, and settle."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The design grid and the scale of its pictures.
+
+    The image is `image_size` pixels square. x = 0 (y = 0 in the side view) lies on the edge between
+    its two middle columns, z = 0 on the edge `ground_margin` pixels above its lower border; the top
+    view has y = 0 between its two middle rows. At 14 pixels a cell a structure may stick out 0.28
+    cells on every side of the 4 x 4 grid before it is cut off: twice what displacement and settling
+    were seen to do.
+
+    Args:
+        width: Of the design grid [cell].
+        height: Of the design grid [cell].
+        image_size: Edge of the silhouette [pixel].
+        pixels_per_cell: Scale.
+        ground_margin: Rows of pixels under the ground line.
+
+    Raises:
+        StackgenError: If a number is not positive (the margin: negative).
+    """
+
+    width: int = 4
+    height: int = 4
+    image_size: int = 64
+    pixels_per_cell: float = 14.0
+    ground_margin: float = 4.0
+
+    def __post_init__(self) -> None:
+        for name, whole in (("width", True), ("height", True), ("image_size", True), ("pixels_per_cell", False)):
+            value = getattr(self, name)
+            if not 0 < value < np.inf or (whole and value != round(value)):
+                kind = "a whole number of at least 1" if whole else "positive and finite"
+                raise StackgenError(f"grid: {name} must be {kind}, got {value}")
+        if not 0 <= self.ground_margin < self.image_size:
+            raise StackgenError(f"grid: ground_margin must lie in 0..image_size, got {self.ground_margin}")
+
+    def require_room(self) -> None:
+        """See that whole stacks fit into the pictures, and the pictures into bytes.
+
+        Raises:
+            StackgenError: If a structure that fills the grid has less than `ROOM` cells beside or above it,
+                or `image_size` is not a multiple of 8.
+        """
+        wide = (self.width + 2 * ROOM) * self.pixels_per_cell
+        high = (self.height + ROOM) * self.pixels_per_cell + self.ground_margin
+        need = 8 * math.ceil(max(wide, high) / 8)
+        if self.image_size < max(wide, high):
+            scale = min(
+                self.image_size / (self.width + 2 * ROOM),
+                (self.image_size - self.ground_margin) / (self.height + ROOM),
+            )
+            raise StackgenError(
+                f"grid: at {self.pixels_per_cell:g} pixels a cell, {self.width} x {self.height} cells do not fit into"
+                f" pictures of {self.image_size}; set image_size to {need} or pixels_per_cell to {math.floor(scale)}"
+            )
+        if self.image_size % 8:
+            raise StackgenError(f"grid: image_size must be a multiple of 8, got {self.image_size}")
+
+    @property
+    def cell_edge(self) -> float:
+        """x [cell] of a line between two columns of cells: 0, or 0.5 where the width is odd."""
+        return self.width % 2 / 2
+
+    def horizontal(self, margin: int = 0) -> Floats:
+        """World coordinate of each column's centre [cell], with `margin` extra pixels on both sides."""
+        columns = np.arange(-margin, self.image_size + margin, dtype=np.float64) + 0.5
+        return (columns - self.image_size / 2) / self.pixels_per_cell
+
+    def vertical(self, view: View, margin: int = 0) -> Floats:
+        """World coordinate of each row's centre [cell], first row at the top of the picture."""
+        rows = np.arange(-margin, self.image_size + margin, dtype=np.float64) + 0.5
+        zero = self.image_size / 2 if view == "top" else self.image_size - self.ground_margin
+        return (zero - rows) / self.pixels_per_cell
+
+
+PAPER_GRID = Grid()
+
+
+@dataclass(frozen=True)
+class World:
+    """What every method is asked in: the shapes there are, the grid that pictures are drawn on, the longest block list.
+
+    Args:
+        catalogue: The shapes.
+        grid: The design grid and the scale of its pictures.
+        max_blocks: Blocks of a stack, at most.
+
+    Raises:
+        StackgenError: If `max_blocks` is not a whole number of at least 1.
+    """
+
+    catalogue: Catalogue
+    grid: Grid
+    max_blocks: int
+
+    def __post_init__(self) -> None:
+        if self.max_blocks != int(self.max_blocks) or self.max_blocks < 1:
+            raise StackgenError(f"world: max_blocks must be a whole number of at least 1, got {self.max_blocks}")
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain form, as manifests and cards carry it beside their other facts."""
+        return {"catalogue": self.catalogue.to_json(), "grid": asdict(self.grid), "max_blocks": self.max_blocks}
+
+    @staticmethod
+    def from_json(facts: Mapping[str, Any]) -> World:
+        """Inverse of :meth:`to_json`; other keys are ignored.
+
+        Raises:
+            StackgenError: If a part is missing or malformed.
+
+        >>> World.from_json(PAPER_WORLD.to_json()) == PAPER_WORLD
+        True
+        """
+        try:
+            grid, max_blocks = Grid(**facts["grid"]), int(facts["max_blocks"])
+            return World(Catalogue.from_json(facts["catalogue"]), grid, max_blocks)
+        except (KeyError, TypeError, ValueError) as error:
+            raise StackgenError(f"a world is a catalogue, a grid and max_blocks: {error!r}") from error
+
+
+PAPER_WORLD = World(PAPER_CATALOGUE, PAPER_GRID, MAX_BLOCKS)
+"""The paper's: four shapes, 4 x 4 cells, 64 x 64 pixels, ten blocks."""

@@ -1,0 +1,185 @@
+"""The command line does what its help says, and leaves whole files only."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stackgen.api import Model
+from stackgen.commands.cli import VERBS
+from stackgen.commands.parsing import own_sections
+from stackgen.errors import StackgenError
+from stackgen.io.stacks_file import read_stacks
+from stackgen.models.weights import last_checkpoint
+from stackgen.training.runs import new_run
+from tests.conftest import CHILD, Cli, draw_tower, stacks_json
+
+FILES = ["stack-1.glb", "stack-2.glb", "stacks.json", "stacks.png"]
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_a_help_with_an_example(verb: str, cli: Cli) -> None:
+    answer = cli(verb, "--help")
+    assert answer.code == 0
+    assert f"example:\n  stackgen {verb}" in answer.out
+
+
+def test_help_lists_every_verb(cli: Cli) -> None:
+    for flag in ("--help", "-h"):
+        answer = cli(flag)
+        assert answer.code == 0
+        assert all(f"  {verb} " in answer.out for verb in VERBS)
+
+
+def test_a_closed_pipe_is_no_error() -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "stackgen", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=CHILD
+    )
+    assert process.stdout is not None
+    process.stdout.close()
+    _, err = process.communicate(timeout=20)
+    assert (process.returncode, err) == (0, b"")
+
+
+def test_sample_leaves_file_picture_and_one_glb_per_stack(
+    cli: Cli, towers: Model, tower_image: Path, tmp_path: Path
+) -> None:
+    answer = cli("sample", tower_image, "--num_samples", 2, "--out", tmp_path / "out")
+    assert answer.code == 0
+    assert names(tmp_path / "out") == FILES
+    content = read_stacks(tmp_path / "out" / "stacks.json")
+    assert content.silhouette == "tower.png"
+    assert content.block_list_source == "cnn"
+    assert content.block_list is not None
+    assert content.block_list.tolist() == [3, 0, 0, 0]
+    assert all(entry.verdict and entry.verdict.stable and entry.front_iou for entry in content.entries)
+    assert answer.out.count("stands") == 2
+
+
+def test_same_seed_same_bytes_other_seed_others(cli: Cli, towers: Model, tower_image: Path, tmp_path: Path) -> None:
+    for folder, seed in (("a", 5), ("b", 5), ("c", 6)):
+        assert cli("sample", tower_image, "--seed", seed, "--out", tmp_path / folder).code == 0
+    for name in ("stacks.json", "stacks.png", "stack-1.glb"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+        assert (tmp_path / "a" / name).read_bytes() != (tmp_path / "c" / name).read_bytes()
+
+
+def test_a_given_block_list_is_used(cli: Cli, towers: Model, tower_image: Path, tmp_path: Path) -> None:
+    cli("sample", tower_image, "--blocks", "cube=1,triangle=1", "--out", tmp_path / "out")
+    content = read_stacks(tmp_path / "out" / "stacks.json")
+    assert content.block_list_source == "given"
+    assert all(stack.names == ["cube", "triangle"] for stack in content.stacks)
+
+
+def test_images_of_one_name_do_not_overwrite_each_other(cli: Cli, towers: Model, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    images = [draw_tower(tmp_path / name) for name in ("a.png", "other/a.png", "b.jpg")]
+    assert cli("sample", *images, "--num_samples", 2, "--out", tmp_path / "out").code == 0
+    assert names(tmp_path / "out") == ["a", "a-2", "b"]
+    assert all(names(tmp_path / "out" / name) == FILES for name in ("a", "a-2", "b"))
+
+
+def test_a_smaller_result_leaves_no_glb_of_a_larger_one(
+    cli: Cli, towers: Model, tower_image: Path, tmp_path: Path
+) -> None:
+    for number in (3, 2):
+        assert cli("sample", tower_image, "--num_samples", number, "--out", tmp_path / "out").code == 0
+    assert names(tmp_path / "out") == FILES
+
+
+def test_interrupted_sample_leaves_the_finished_images_only(
+    cli: Cli, towers: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    images = [draw_tower(tmp_path / f"{name}.png") for name in "abc"]
+    judged, check = [], towers.checker.check
+
+    def check_until_ctrl_c(stack: object) -> object:
+        judged.append(stack)
+        if len(judged) == 3:
+            raise KeyboardInterrupt
+        return check(stack)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(towers.checker, "check", check_until_ctrl_c)
+    answer = cli("sample", *images, "--num_samples", 2, "--out", tmp_path / "out")
+    assert answer.code == 130
+    assert "interrupted; 1 of 3 images are finished" in answer.line
+    assert names(tmp_path / "out") == ["a"]
+    assert names(tmp_path / "out" / "a") == FILES
+
+
+def test_check_answers_by_its_exit_code_and_names_what_fell(cli: Cli, stands: Path, tmp_path: Path) -> None:
+    answer = cli("check", stands)
+    assert answer.code == 0
+    assert "stands" in answer.out
+    falls = tmp_path / "falls.json"
+    falls.write_text(json.dumps(stacks_json([("cube", 0, 0.5)], [("cube", 0, 0.5), ("triangle", 1.5, 3.5)])))
+    answer = cli("check", falls, "--out", tmp_path / "judged.json")
+    assert answer.code == 1
+    assert "block 1 (triangle) 3.0 cells" in answer.out
+    verdicts = [entry.verdict for entry in read_stacks(tmp_path / "judged.json").entries]
+    assert [verdict and verdict.stable for verdict in verdicts] == [True, False]
+    assert verdicts[1] is not None
+    np.testing.assert_allclose(verdicts[1].settled.poses[1, 2], 0.5, atol=0.02)
+
+
+def test_check_of_a_sample_finds_the_same_verdicts(cli: Cli, towers: Model, tower_image: Path, tmp_path: Path) -> None:
+    cli("sample", tower_image, "--out", tmp_path / "out")
+    file = tmp_path / "out" / "stacks.json"
+    assert cli("check", file, "--out", tmp_path / "again.json").code == 0
+    before, after = read_stacks(file), read_stacks(tmp_path / "again.json")
+    for old, new in zip(before.entries, after.entries, strict=True):
+        assert old.verdict is not None
+        assert new.verdict is not None
+        np.testing.assert_array_equal(old.verdict.settled.poses, new.verdict.settled.poses)
+        assert old.front_iou == new.front_iou
+
+
+def test_show_writes_picture_and_page(cli: Cli, stands: Path, tmp_path: Path) -> None:
+    assert cli("show", stands).code == 0
+    assert cli("show", stands, "--out", tmp_path / "other.jpg").code == 0
+    assert (tmp_path / "stands.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "other.jpg").read_bytes().startswith(b"\xff\xd8")
+    for page in ("stands.html", "other.html"):
+        assert "triangle" in (tmp_path / page).read_text()
+
+
+def test_each_verb_reads_its_own_section_of_a_shared_file(tmp_path: Path) -> None:
+    shared = tmp_path / "quick.yaml"
+    shared.write_text("sample: {seed: 3}\nfit: {name: quick}\n")
+    assert own_sections("sample", ["--config", str(shared)]) == ["--config", "seed: 3\n"]
+    assert own_sections("fit", ["-c", str(shared)]) == ["-c", "name: quick\n"]
+    assert own_sections("fit", [f"--config={shared}"]) == ["--config=name: quick\n"]
+    assert own_sections("check", ["--config", str(shared)]) == ["--config", str(shared)]
+
+
+def test_a_section_is_used(cli: Cli, towers: Model, tower_image: Path, tmp_path: Path) -> None:
+    shared = tmp_path / "quick.yaml"
+    shared.write_text(f"sample: {{seed: 3, num_samples: 2, out: {tmp_path / 'out'}}}\nfit: {{name: quick}}\n")
+    assert cli("sample", tower_image, "--config", shared).code == 0
+    content = read_stacks(tmp_path / "out" / "stacks.json")
+    assert (content.seed, len(content.stacks)) == (3, 2)
+
+
+def test_runs_never_share_a_folder_and_the_newest_checkpoint_wins(tmp_path: Path) -> None:
+    first, second = new_run("x", tmp_path), new_run("x", tmp_path)
+    assert (first.name, second.name) == ("version_0", "version_1")
+    with pytest.raises(StackgenError, match="no checkpoint"):
+        last_checkpoint(tmp_path / "x")
+    for age, folder in ((100, first), (200, second)):
+        (folder / "checkpoints").mkdir()
+        (folder / "checkpoints" / "last.ckpt").touch()
+        os.utime(folder / "checkpoints" / "last.ckpt", (age, age))
+    assert last_checkpoint(tmp_path / "x") == second / "checkpoints" / "last.ckpt"
+    assert last_checkpoint(first) == first / "checkpoints" / "last.ckpt"
+    with pytest.raises(StackgenError, match="run name"):
+        new_run("../x", tmp_path)

@@ -1,0 +1,240 @@
+"""fit, validate, test, predict and export: every run its own folder, and a killed one goes on."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from stackgen.io.stacks_file import read_stacks
+from stackgen.models.optimization import OptimizerConfig, learning_rate_share
+from stackgen.models.weights import last_checkpoint, load_sampler
+from tests.conftest import CHILD, Cli, TinyWeights, allow_interrupts
+
+CONFIG = """
+name: tiny
+trainer: {{max_epochs: {epochs}, log_every_n_steps: 1, enable_progress_bar: false, enable_model_summary: false}}
+model:
+  class_path: stackgen.models.diffusion.module.DDPM
+  init_args:
+    denoiser: {{width: 32, layers: 1, heads: 2, feedforward: 64}}
+    optimizer: {{learning_rate: 0.001, warmup: 2}}
+data: {{path: {data}, batch_size: 16, test_path: {data}}}
+"""
+
+
+@pytest.fixture
+def config(tmp_path: Path, towers_dataset: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A small model on a small dataset; runs go below the test's own folder."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    path = tmp_path / "tiny.yaml"
+    path.write_text(CONFIG.format(epochs=2, data=towers_dataset))
+    return path
+
+
+def steps(checkpoint: Path) -> int:
+    return int(torch.load(checkpoint, weights_only=True, map_location="cpu")["global_step"])
+
+
+def test_each_run_has_its_own_folder_with_its_configuration(cli: Cli, config: Path) -> None:
+    for number in range(2):
+        answer = cli("fit", "--config", config, "--data.batch_size", 24)
+        assert answer.code == 0, answer.err
+        folder = Path(f"runs/tiny/version_{number}")
+        saved = yaml.safe_load((folder / "config.yaml").read_text())
+        assert saved["data"]["batch_size"] == 24
+        assert saved["model"]["init_args"]["denoiser"]["width"] == 32
+        with (folder / "metrics.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        assert any(row["train/loss"] for row in rows) and any(row["validation/loss"] for row in rows)
+        assert steps(folder / "checkpoints" / "last.ckpt") == 4
+
+
+def test_a_run_is_written_down_whatever_its_loggers(cli: Cli, config: Path) -> None:
+    for number in range(2):
+        answer = cli("fit", "--config", config, "--trainer.logger", "false")
+        assert answer.code == 0, answer.err
+        folder = Path(f"runs/tiny/version_{number}")
+        assert sorted(path.name for path in folder.iterdir()) == ["checkpoints", "config.yaml", "run.json"]
+    assert [path.name for path in Path("runs").iterdir()] == ["tiny"]
+
+
+def test_a_checkpoint_alone_goes_on_with_its_run_s_settings(cli: Cli, config: Path) -> None:
+    assert cli("fit", "--config", config, "--trainer.gradient_clip_val", 0.5, "--dashboard", "none").code == 0
+    answer = cli("fit", "--ckpt_path", "runs/tiny/version_0/checkpoints/last.ckpt", "--trainer.max_epochs", 3)
+    assert answer.code == 0, answer.err
+    first, second = (yaml.safe_load(Path(f"runs/tiny/version_{n}/config.yaml").read_text()) for n in (0, 1))
+    assert second.pop("ckpt_path") == "runs/tiny/version_0/checkpoints/last.ckpt"
+    assert second["trainer"].pop("max_epochs") == 3
+    del first["ckpt_path"], first["trainer"]["max_epochs"]
+    assert second == first
+    assert steps(Path("runs/tiny/version_1/checkpoints/last.ckpt")) == 9
+
+
+FAST = """
+trainer:
+  precision: bf16-mixed
+  accumulate_grad_batches: 2
+  max_epochs: 3
+  callbacks: [{{class_path: stackgen.training.callbacks.Compile, init_args: {{backend: {backend}}}}},
+              {{class_path: stackgen.training.callbacks.EMA}}]
+"""
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize(
+    "backend",
+    [
+        "aot_eager",
+        pytest.param(
+            "inductor",
+            marks=[pytest.mark.slow, pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")],
+        ),
+    ],
+)
+def test_half_precision_accumulation_and_compilation_are_settings(backend: str, cli: Cli, config: Path) -> None:
+    """48 samples are three batches of 16 and two steps an epoch; schedule and average go by steps."""
+    Path("fast.yaml").write_text(FAST.format(backend=backend))
+    answer = cli("fit", "--config", config, "--config", "fast.yaml", "--dashboard", "none")
+    assert answer.code == 0, answer.err
+    checkpoint = torch.load("runs/tiny/version_0/checkpoints/last.ckpt", weights_only=True)
+    assert checkpoint["global_step"] == checkpoint["callbacks"]["EMA"]["updates"] == 6
+    assert {t.dtype for t in checkpoint["state_dict"].values() if t.is_floating_point()} == {torch.float32}
+    with Path("runs/tiny/version_0/metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    course = [learning_rate_share(step, 6, OptimizerConfig(warmup=2)) for step in range(6)]
+    rates = [float(row["train/learning_rate"]) / 0.001 for row in rows if row["train/learning_rate"]]
+    assert rates == pytest.approx(course, rel=1e-5)
+    assert cli("export", "runs/tiny", "--out", "tiny.safetensors").code == 0
+    assert load_sampler("tiny.safetensors") is not None
+
+
+def test_the_saved_configuration_runs_again(cli: Cli, config: Path) -> None:
+    assert cli("fit", "--config", config).code == 0
+    answer = cli("fit", "--config", "runs/tiny/version_0/config.yaml")
+    assert answer.code == 0, answer.err
+    first, second = (
+        torch.load(last_checkpoint(Path(f"runs/tiny/version_{n}")), weights_only=True)["state_dict"] for n in (0, 1)
+    )
+    assert all(torch.equal(first[name], second[name]) for name in first)
+
+
+def test_resuming_goes_on_where_the_run_ended(cli: Cli, config: Path) -> None:
+    assert cli("fit", "--config", config).code == 0
+    answer = cli("fit", "--config", config, "--ckpt_path", "last", "--trainer.max_epochs", 3)
+    assert answer.code == 0, answer.err
+    assert steps(Path("runs/tiny/version_0/checkpoints/last.ckpt")) == 6
+    assert steps(Path("runs/tiny/version_1/checkpoints/last.ckpt")) == 9
+    with Path("runs/tiny/version_1/metrics.csv").open() as file:
+        assert {row["epoch"] for row in csv.DictReader(file)} == {"2"}
+
+
+def test_a_checkpoint_of_another_shape_is_refused_in_one_line(cli: Cli, config: Path) -> None:
+    assert cli("fit", "--config", config).code == 0
+    wide = ["--model.denoiser.width", 64, "--ckpt_path", "last"]
+    answer = cli("fit", "--config", config, *wide)
+    assert answer.code == 2
+    assert "does not fit the model" in answer.err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGINT])
+def test_a_run_that_was_stopped_goes_on(blow: signal.Signals, cli: Cli, config: Path) -> None:
+    config.write_text(config.read_text().replace("max_epochs: 2", "max_epochs: 100000"))
+    process = subprocess.Popen(
+        [sys.executable, "-m", "stackgen", "fit", "--config", str(config)],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+        env={**CHILD, "WANDB_MODE": "disabled"},
+        preexec_fn=allow_interrupts,
+    )
+    last = Path("runs/tiny/version_0/checkpoints/last.ckpt")
+    while not last.exists():
+        assert process.poll() is None
+        time.sleep(0.05)
+    process.send_signal(blow)
+    _, err = process.communicate(timeout=60)
+    if blow is signal.SIGINT:
+        assert process.returncode == 130
+        assert "interrupted; go on with --ckpt_path last" in err.splitlines()[-1]
+    done = steps(last)
+    assert done >= 3
+    epochs = done // 3 + 2
+    answer = cli("fit", "--config", config, "--ckpt_path", "last", "--trainer.max_epochs", epochs)
+    assert answer.code == 0, answer.err
+    assert steps(Path("runs/tiny/version_1/checkpoints/last.ckpt")) == 3 * epochs
+
+
+def test_validate_finds_the_configuration_beside_the_checkpoint(cli: Cli, config: Path) -> None:
+    assert cli("fit", "--config", config).code == 0
+    answer = cli("validate", "--ckpt_path", "runs/tiny/version_0/checkpoints/last.ckpt")
+    assert answer.code == 0, answer.err
+    metrics = json.loads(Path("runs/tiny/validate_0/metrics.json").read_text())
+    with Path("runs/tiny/version_0/metrics.csv").open() as file:
+        logged = [row["validation/loss"] for row in csv.DictReader(file) if row["validation/loss"]]
+    assert metrics["validation/loss"] == pytest.approx(float(logged[-1]), rel=1e-5)
+
+
+def test_protocol_of_a_checkpoint_leaves_figures_for_both_lists_and_the_ceiling(
+    cli: Cli, config: Path, tiny: TinyWeights, towers_dataset: Path
+) -> None:
+    assert cli("fit", "--config", config).code == 0
+    data = ["--data.path", towers_dataset, "--data.test_path", towers_dataset]
+    options = ["--model.block_list_weights", tiny.predictor, "--trainer.enable_progress_bar", "false"]
+    answer = cli("test", "--ckpt_path", "runs/tiny/version_0/checkpoints/last.ckpt", *data, *options)
+    assert answer.code == 0, answer.err
+    content = json.loads(Path("runs/run/test_0/metrics.json").read_text())
+    assert [row["block_list"] for row in content["rows"]] == ["ground truth", "predicted", "ground truth"]
+    assert [row["scenes"] for row in content["rows"]] == [12, 12, 12]
+    assert content["rows"][2]["metrics"]["stability"]["value"] == 1  # the ceiling: towers stand
+    assert len(list(Path("runs/run/test_0").glob("scenes-*.csv"))) == 3
+    run = json.loads(Path("runs/run/test_0/run.json").read_text())
+    assert run["dataset"]["path"] == str(towers_dataset) and len(run["dataset"]["sha256"]) == 64
+
+
+def test_a_block_list_network_is_tested_with_the_shipped_sampler(
+    cli: Cli, tiny: TinyWeights, towers_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    data = ["--data.path", towers_dataset, "--data.test_path", towers_dataset]
+    options = ["--model.weights", tiny.sampler, "--trainer.enable_progress_bar", "false"]
+    answer = cli("test", "--ckpt_path", tiny.predictor, *data, *options)
+    assert answer.code == 0, answer.err
+    asked = yaml.safe_load(Path("runs/run/test_0/config.yaml").read_text())["model"]["init_args"]
+    assert asked["weights"] == str(tiny.sampler) and asked["block_list_weights"] == str(tiny.predictor)
+    assert json.loads(Path("runs/run/test_0/metrics.json").read_text())["rows"][1]["block_list"] == "predicted"
+
+
+def test_predict_writes_a_stacks_file_for_each_scene(
+    cli: Cli, config: Path, tiny: TinyWeights, towers_dataset: Path
+) -> None:
+    data = ["--data.path", towers_dataset, "--data.test_path", towers_dataset]
+    weights = ["--model.weights", tiny.sampler, "--model.num_samples", 2, "--trainer.enable_progress_bar", "false"]
+    answer = cli("predict", *data, *weights, "--trainer.default_root_dir", "out")
+    assert answer.code == 0, answer.err
+    files = sorted(Path("out/run/predict_0").glob("*-t*.json"))
+    assert len(files) == 12
+    content = read_stacks(files[1])
+    assert content.target is not None and content.block_list is not None
+    assert content.block_list.tolist() == [2, 0, 0, 0]
+    assert [stack.names for stack in content.stacks] == [["cube", "cube"]] * 2
+
+
+def test_an_exported_checkpoint_samples_as_the_checkpoint_does(cli: Cli, config: Path, tower_image: Path) -> None:
+    assert cli("fit", "--config", config).code == 0
+    assert cli("export", "runs/tiny", "--out", "tiny.safetensors").code == 0
+    assert load_sampler("tiny.safetensors") is not None
+    for weights, out in (("tiny.safetensors", "a"), ("runs/tiny", "b")):
+        answer = cli("sample", tower_image, "--blocks", "cube=3", "--weights", weights, "--out", out)
+        assert answer.code == 0, answer.err
+    assert Path("a/stack-1.glb").read_bytes() == Path("b/stack-1.glb").read_bytes()

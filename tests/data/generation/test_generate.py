@@ -1,0 +1,312 @@
+"""The generator: the same dataset from the same settings, whoever makes it and however often it is cut off."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stackgen.data.generation import generate as module
+from stackgen.data.generation.generate import GenerateSettings, generate, template_samples, testset_layouts
+from stackgen.data.generation.templates import Template, TemplateSettings
+from stackgen.data.generation.workshop import Shard
+from stackgen.data.shards import SPLITS, Manifest, Sample, read_shard
+from stackgen.errors import StackgenError
+from stackgen.geometry import silhouette
+from stackgen.sim.checkers import AcceptLimits
+from stackgen.sim.physics import Physics
+from stackgen.sim.simulator import Simulator
+from stackgen.sim.statics.plane import Certificate
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Shape
+from tests.conftest import Cli
+from tests.data.generation.making import SMALL, Here, Stored, contents, copy, flip
+
+testset_layouts.__test__ = False  # type: ignore[attr-defined]  # a function of the generator, not a test
+
+
+def samples_of(folder: Path) -> list[Sample]:
+    manifest = Manifest.load(folder)
+    return [sample for split in SPLITS for sample in manifest.samples(folder, split)]
+
+
+@pytest.fixture(scope="module")
+def simulator() -> Iterator[Simulator]:
+    with Simulator() as simulator:
+        yield simulator
+
+
+# The same bytes.
+
+
+def test_what_is_lost_is_made_again(small: Path, shards: dict[int, Shard], tmp_path: Path) -> None:
+    out = copy(small, tmp_path / "copy")
+    first, *_, last = sorted(out.glob("*.tar"), key=lambda path: path.name[-10:])
+    first.unlink()
+    last.unlink()
+    (out / "dataset.json").unlink()
+    (out / ".train-000001.tar.0123abcd.tmp").write_bytes(b"half")
+    generate(SMALL, out, executor=Stored(shards))
+    assert contents(out) == contents(small)
+
+
+def test_the_settings_of_a_manifest_are_those_it_was_made_with(small: Path) -> None:
+    assert GenerateSettings.from_manifest(Manifest.load(small)) == SMALL
+    template = TemplateSettings(top_row_only=("triangle", "cube"))
+    other = replace(SMALL, physics=Physics(friction=0.4), template=template, accept=AcceptLimits(tilt=0.2))
+    manifest = Manifest(
+        other.name, other.seed, other.catalogue, other.grid, other.max_blocks, other.physics.to_json(), other.to_json()
+    )
+    assert GenerateSettings.from_manifest(manifest) == other
+    strange = replace(manifest, settings={**manifest.settings, "sturdy": True})
+    with pytest.raises(StackgenError, match=r"not made by this version .*sturdy"):
+        GenerateSettings.from_manifest(strange)
+
+
+def test_a_draw_is_part_of_the_whole_and_drawing_again_changes_nothing(
+    small: Path, shards: dict[int, Shard], tmp_path: Path
+) -> None:
+    out = tmp_path / "drawn"
+    settings = replace(SMALL, stacks=30, draw=15)
+    manifest = generate(settings, out, executor=Stored(shards))
+    assert sum(manifest.count(split) for split in SPLITS) == 15 and len(manifest.shards) == 1
+    tar = manifest.shards[0]["file"]
+    assert sorted(path.name for path in out.iterdir()) == ["README.md", "dataset.json", "generate.json", tar]
+    drawn = samples_of(out)
+    whole = {sample.key: sample for sample in samples_of(small)}
+    order = sorted(whole, key=lambda key: key[:8])  # stable: as the generator wrote them
+    places = [order.index(sample.key) for sample in drawn]
+    assert places == sorted(set(places))
+    assert all((whole[sample.key].poses == sample.poses).all() for sample in drawn)
+    before = contents(out)
+    generate(settings, out, executor=Stored({}))
+    assert contents(out) == before
+
+
+def test_another_seed_makes_another_dataset(small: Path, simulator: Simulator) -> None:
+    number = samples_of(small)[0].meta["template"]
+    here, there = (template_samples(replace(SMALL, seed=s), number, frozenset(), simulator) for s in (5, 6))
+    assert {s.meta["layout"] for s in here} != {s.meta["layout"] for s in there}
+
+
+# What is in it.
+
+
+def test_there_are_exactly_as_many_stacks_as_asked_for(small: Path) -> None:
+    manifest = Manifest.load(small)
+    assert sum(manifest.count(split) for split in SPLITS) == 45 == len(samples_of(small))
+    assert sorted(p.name for p in small.glob("*.tar")) == sorted(shard["file"] for shard in manifest.shards)
+    for shard in manifest.shards:
+        content = (small / shard["file"]).read_bytes()
+        assert hashlib.sha256(content).hexdigest() == shard["sha256"]
+        assert shard["samples"] == len(list(read_shard(small / shard["file"]))) > 0
+        assert shard["file"].startswith(shard["split"] + "-")
+
+
+def test_no_template_is_in_two_splits(small: Path) -> None:
+    manifest = Manifest.load(small)
+    templates = {split: {s.meta["template"] for s in manifest.samples(small, split)} for split in SPLITS}
+    assert sum(map(bool, templates.values())) >= 2
+    assert all(templates[a].isdisjoint(templates[b]) for a, b in combinations(SPLITS, 2))
+
+
+def test_the_splits_have_their_shares_from_early_on() -> None:
+    settings = GenerateSettings("x", 1)
+    for count in (50, 100, 764, 2000):
+        splits = [settings.split_of(shard) for shard in range(count)]
+        for split, share in (("train", 0.88), ("validation", 0.02), ("test", 0.10)):
+            assert splits.count(split) / count == pytest.approx(share, abs=2 / count + 0.01)  # type: ignore[arg-type]
+    assert {GenerateSettings("x", 1, validation=0, test=0).split_of(i) for i in range(50)} == {"train"}
+    assert {GenerateSettings("x", 1, validation=0, test=1).split_of(i) for i in range(50)} == {"test"}
+
+
+def test_samples_are_what_the_format_says(small: Path) -> None:
+    found = samples_of(small)
+    assert len({sample.key for sample in found}) == 45
+    by_template = defaultdict(list)
+    for sample in found:
+        assert sample.shapes.dtype == np.uint8 and 1 <= len(sample.shapes) <= 10
+        assert sample.poses.dtype == np.float32 and sample.poses.shape == (len(sample.shapes), 6)
+        assert (sample.silhouette == silhouette(sample.stack(PAPER_CATALOGUE))).all()
+        design = Template.from_key(sample.meta["layout"])
+        kinds = [shape for row in design.rows for shape, _ in row]
+        assert sample.shapes.tolist() == np.delete(kinds, sample.meta["removed"]).tolist()
+        assert len(sample.meta["removed"]) <= 4
+        by_template[sample.meta["template"]].append(sample)
+    for family in by_template.values():
+        ways = [tuple(sample.meta["removed"]) for sample in family]
+        assert len(set(ways)) == len(ways)
+
+
+def test_no_stack_is_stored_twice(small: Path) -> None:
+    for a, b in combinations(samples_of(small), 2):
+        assert a.shapes.tolist() != b.shapes.tolist() or np.abs(a.poses - b.poses).max() > 1e-3
+
+
+def test_long_lists_are_not_stored_but_still_deconstructed(simulator: Simulator) -> None:
+    def ways(max_blocks: int, number: int) -> set[tuple[int, ...]]:
+        settings = replace(SMALL, max_blocks=max_blocks)
+        return {tuple(s.meta["removed"]) for s in template_samples(settings, number, frozenset(), simulator)}
+
+    number = next(n for n in range(100) if len(ways(10, n)) > 3)
+    everything = ways(16, number)
+    most = max(map(len, everything))
+    total = len(template_samples(replace(SMALL, max_blocks=16), number, frozenset(), simulator)[0].shapes)
+    assert ways(total - most, number) == {way for way in everything if len(way) == most}
+
+
+# The frozen test set stays out.
+
+
+def test_layouts_of_the_test_set_and_their_mirror_images_are_left_out(small: Path, simulator: Simulator) -> None:
+    layouts = testset_layouts(PAPER_CATALOGUE, PAPER_GRID)
+    frozen = list(Manifest.load(module.TESTSET).samples(module.TESTSET, "test"))
+    for sample in frozen[::25]:
+        design = Template.from_key(sample.meta["layout"])
+        assert {design.key, design.mirrored(PAPER_CATALOGUE, PAPER_GRID).key} <= layouts
+    assert {s.meta["layout"] for s in samples_of(small)}.isdisjoint(layouts)
+    sample = samples_of(small)[0]
+    number, key = sample.meta["template"], sample.meta["layout"]
+    assert template_samples(SMALL, number, frozenset([key]), simulator) == []
+    assert template_samples(SMALL, number, frozenset(["other"]), simulator) != []
+
+
+def test_a_generator_that_meets_a_test_layout_leaves_it_out(
+    small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With its own first templates as the test set, a dataset begins after them."""
+    frozen = tmp_path / "testset"
+    first = generate(
+        replace(SMALL, stacks=8, draw=8, validation=0, test=1, exclude_testset=False), frozen, executor=Here()
+    )
+    forbidden = {sample.meta["layout"] for sample in first.samples(frozen, "test")}
+    assert forbidden & {sample.meta["layout"] for sample in samples_of(small)}
+    monkeypatch.setattr(module, "TESTSET", frozen)
+    generate(replace(SMALL, stacks=12), tmp_path / "rest", executor=Here())
+    found = {sample.meta["layout"] for sample in samples_of(tmp_path / "rest")}
+    assert found and found.isdisjoint(forbidden)
+
+
+def test_the_test_set_is_left_out_of_catalogues_that_number_shapes_otherwise() -> None:
+    layouts = testset_layouts(PAPER_CATALOGUE, PAPER_GRID)
+    turned = Catalogue(PAPER_CATALOGUE.shapes[::-1])
+    rows = {tuple(tuple((3 - s, left) for s, left in row) for row in Template.from_key(k).rows) for k in layouts}
+    assert testset_layouts(turned, PAPER_GRID) == {Template(design).key for design in rows}
+    assert testset_layouts(PAPER_CATALOGUE, Grid(width=5)) == set()
+    shorter = testset_layouts(Catalogue(PAPER_CATALOGUE.shapes[:2]), PAPER_GRID)
+    assert shorter == {key for key in layouts if "2@" not in key and "3@" not in key}
+    longer = Catalogue((*PAPER_CATALOGUE.shapes[:2], Shape.box("long_rectangle", 4), PAPER_CATALOGUE[3]))
+    assert testset_layouts(longer, PAPER_GRID) == {key for key in layouts if "2@" not in key}
+
+
+# Refusals.
+
+
+def test_a_folder_of_other_settings_is_refused_and_left_alone(small: Path) -> None:
+    before = contents(small)
+    for other in (
+        replace(SMALL, seed=6),
+        replace(SMALL, stacks=46),
+        replace(SMALL, physics=Physics(friction=0.4)),
+        replace(SMALL, accept=AcceptLimits(tilt=0.2)),
+        replace(SMALL, template=TemplateSettings(displacement=0.2)),
+    ):
+        with pytest.raises(StackgenError, match="other settings") as caught:
+            generate(other, small, executor=Stored({}))
+        assert "\n" not in str(caught.value)
+    assert contents(small) == before
+
+
+def test_a_folder_of_the_same_settings_from_before_they_were_all_written_down_is_accepted(
+    shards: dict[int, Shard], tmp_path: Path
+) -> None:
+    plain = replace(SMALL, certificate=Certificate(enabled=False), settle_twice=False)
+    generate(plain, tmp_path, executor=Stored(shards))
+    claim = tmp_path / "generate.json"
+    before = json.loads(claim.read_text())
+    del before["settings"]["certificate"], before["settings"]["revision"]
+    claim.write_text(json.dumps(before))
+    generate(plain, tmp_path, executor=Stored({}))
+    for other in (SMALL, replace(plain, seed=7)):
+        with pytest.raises(StackgenError, match="other settings"):
+            generate(other, tmp_path, executor=Stored({}))
+    claim.write_text("{")
+    with pytest.raises(StackgenError, match="other settings"):
+        generate(plain, tmp_path, executor=Stored({}))
+
+
+def test_a_folder_of_unknown_shards_is_refused(small: Path, tmp_path: Path) -> None:
+    (tmp_path / "train-000000.tar").write_bytes(next(small.glob("*.tar")).read_bytes())
+    with pytest.raises(StackgenError, match=r"no generate\.json"):
+        generate(SMALL, tmp_path, executor=Stored({}))
+    assert [path.name for path in tmp_path.iterdir()] == ["train-000000.tar"]
+
+
+def test_damage_since_the_dataset_was_complete_is_named_with_the_way_out(small: Path, tmp_path: Path) -> None:
+    out = copy(small, tmp_path / "copy")
+    victim, other = (out / entry["file"] for entry in Manifest.load(out).shards[:2])
+    flip(victim, 600)
+    before = contents(out)
+    line = rf"{victim.name}: missing or damaged .* `stackgen dataset repair {out}`"
+    with pytest.raises(StackgenError, match=line) as caught:
+        generate(SMALL, out, executor=Stored({}))
+    assert "\n" not in str(caught.value) and contents(out) == before
+    other.unlink()
+    with pytest.raises(StackgenError, match=f"{victim.name} and 1 more"):
+        generate(SMALL, out, executor=Stored({}))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"stacks": 0}, {"templates_per_shard": 0}, {"max_blocks": 0}, {"max_removals": -1}, {"draw": 46}, {"draw": -1},
+        {"validation": -0.1}, {"test": -0.1}, {"validation": 0.6, "test": 0.6},
+    ],
+)  # fmt: skip
+def test_settings_that_make_no_sense_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(StackgenError, match="generate: "):
+        replace(SMALL, **change)  # type: ignore[arg-type]
+
+
+def test_settings_that_no_stack_can_meet_end_with_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_HOPELESS", 2)
+    with pytest.raises(StackgenError, match="gave no stack"):
+        generate(replace(SMALL, max_blocks=3, templates_per_shard=1), tmp_path / "none", executor=Here())
+
+
+# The command line.
+
+SMALL_OPTIONS = [
+    "--name", "small", "--stacks", 45, "--seed", 5, "--templates_per_shard", 2, "--validation", 0.2, "--test", 0.2,
+]  # fmt: skip
+
+
+def test_jobs_make_ranges_and_a_run_without_one_collects_them(
+    small: Path, shards: dict[int, Shard], tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stackgen.commands.generate.make_executor", lambda *_: Stored(shards))
+    out = ["--out", tmp_path / "small"]
+    answer = cli("generate", *SMALL_OPTIONS, *out, "--shard_range", "1:3")
+    assert answer.code == 0 and f"{shards[1].samples + shards[2].samples} stacks" in answer.out
+    assert sorted(p.name for p in (tmp_path / "small").glob("*.tar")) == sorted(shards[n].name for n in (1, 2))
+    assert cli("generate", *SMALL_OPTIONS, *out).code == 0
+    assert contents(tmp_path / "small") == contents(small)
+
+
+@pytest.mark.parametrize("text", ["3", "3:3", "5:2", "-1:2", "a:b", "1:2:3"])
+def test_a_range_that_makes_no_sense_is_one_line(text: str, tmp_path: Path, cli: Cli) -> None:
+    answer = cli("generate", *SMALL_OPTIONS, "--out", tmp_path / "x", f"--shard_range={text}")
+    assert answer.code == 2 and "should read A:B" in answer.line and not (tmp_path / "x").exists()
+
+
+def test_executors_and_workers_that_do_not_exist_are_one_line(tmp_path: Path, cli: Cli) -> None:
+    out = ["--out", tmp_path / "x"]
+    assert "ray" in cli("generate", *SMALL_OPTIONS, *out, "--executor", "cloud").line
+    assert "at least 1" in cli("generate", *SMALL_OPTIONS, *out, "--workers", 0).line
+    assert not (tmp_path / "x").exists()

@@ -1,0 +1,386 @@
+"""Streaming gives the same batches as memory does, and says what it could not read."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from stackgen.data.datamodule import StackDataModule
+from stackgen.data.loading import order, streaming
+from stackgen.data.loading.arrays import StackArrays, load_dataset
+from stackgen.data.loading.streaming import ExactStream, TrainingStream
+from stackgen.data.shards import Manifest, Sample, write_shard
+from stackgen.errors import StackgenError
+
+TRAIN, VALIDATION = 71, 23  # samples of `dataset`
+
+
+def _place(rank: int, world: int = 3) -> tuple[int, int]:
+    return rank, world
+
+
+@pytest.fixture(autouse=True)
+def small_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A window to suit the data."""
+    monkeypatch.setattr(order, "WINDOW", 16)
+
+
+@contextmanager
+def said() -> Iterator[list[str]]:
+    """The lines of the data module while this runs."""
+    lines: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("default")
+        yield lines
+    lines += [str(w.message) for w in caught if str(w.message).startswith("data")]
+    assert not any("\n" in line for line in lines)
+
+
+def templates(batches: Any) -> list[int]:
+    return [t for batch in batches for t in batch["template"].tolist()]
+
+
+def copy_of(dataset: Path, folder: Path, **shards: list[Sample]) -> Path:
+    """The dataset with other samples in some shards, as if it had been written so; `train_000001` names a shard."""
+    shutil.copytree(dataset, folder)
+    manifest = Manifest.load(folder)
+    entries = {entry["file"]: entry for entry in manifest.shards}
+    for name, samples in shards.items():
+        file = name.replace("_", "-") + ".tar"
+        entries[file] = write_shard(folder / file, samples)
+    replace(manifest, shards=tuple(entries.values())).save(folder)
+    return folder
+
+
+@pytest.fixture
+def damaged(dataset: Path, tmp_path: Path) -> Path:
+    """The dataset with a training shard cut short, and one bit of a pose changed in the validation shard."""
+    folder = tmp_path / "damaged"
+    shutil.copytree(dataset, folder)
+    content = (folder / "train-000000.tar").read_bytes()
+    (folder / "train-000000.tar").write_bytes(content[: len(content) // 2])
+    flipped = bytearray((folder / "validation-000002.tar").read_bytes())
+    flipped[flipped.index(b"\x93NUMPY") + 140] ^= 1
+    (folder / "validation-000002.tar").write_bytes(flipped)
+    return folder
+
+
+@pytest.fixture
+def faulty(dataset: Path, samples: dict[str, list[Sample]], tmp_path: Path) -> Path:
+    """The dataset with a broken sample in a training shard and two in the validation shard, checksums being right."""
+    train, validation = list(samples["train-000001.tar"]), list(samples["validation-000002.tar"])
+    train[4] = replace(train[4], poses=np.full_like(train[4].poses, np.nan))
+    validation[0] = replace(validation[0], shapes=validation[0].shapes + 200)
+    validation[9] = replace(validation[9], silhouette=np.zeros((32, 32), bool))
+    return copy_of(dataset, tmp_path / "faulty", train_000001=train, validation_000002=validation)
+
+
+# What an epoch is.
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_an_exact_stream_is_the_split_in_memory(dataset: Path, splits: dict[str, StackArrays], workers: int) -> None:
+    data = StackDataModule(dataset, batch_size=10, mode="stream", num_workers=workers, test_path=dataset)
+    for loader, split in ((data.val_dataloader(), "validation"), (data.test_dataloader(), "test")):
+        batches = list(loader)
+        assert len(batches) == len(loader)  # type: ignore[arg-type]
+        expected = splits[split].batch(np.arange(len(splits[split])))
+        assert all(torch.equal(torch.cat([b[name] for b in batches]), expected[name]) for name in expected)
+
+
+@pytest.mark.parametrize("batch_size", [1, 4, 7, 50])
+def test_ranks_share_an_exact_stream(dataset: Path, splits: dict[str, StackArrays], batch_size: int) -> None:
+    streams = [ExactStream(dataset, "validation", batch_size, place=partial(_place, rank)) for rank in range(3)]
+    cached = StackDataModule(dataset, batch_size=batch_size)
+    shares = [[batch["template"].tolist() for batch in stream] for stream in streams]
+    assert [len(share) for share in shares] == [len(stream) for stream in streams]
+    assert len({len(share) for share in shares}) == 1
+    together = [t for share in shares for batch in share for t in batch]
+    assert sorted(together) == templates(cached.val_dataloader())
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("world", [1, 3])
+def test_an_epoch_visits_everyone_at_most_once_and_leaves_out_less_than_a_step(
+    dataset: Path, splits: dict[str, StackArrays], workers: int, world: int
+) -> None:
+    arrays, batch_size = splits["train"], 5
+    place = {t: i for i, t in enumerate(arrays.template.tolist())}
+    sign, images = torch.tensor([-1.0, 1, 1, 1, -1, -1]), torch.from_numpy(arrays.images())
+    seen, flips = Counter[int](), []
+    for rank in range(world):
+        stream = TrainingStream(
+            dataset, batch_size, num_workers=workers, mirror=True, place=partial(_place, rank, world)
+        )
+        batches = list(stream)
+        assert len(batches) == len(stream) == TRAIN // (batch_size * world)
+        seen.update(templates(batches))
+        for batch in batches:
+            assert len(batch["template"]) == batch_size
+            for t, poses, image in zip(batch["template"].tolist(), batch["poses"], batch["silhouette"], strict=True):
+                original = torch.from_numpy(arrays.poses[place[t]])
+                flipped = not torch.equal(poses, original)
+                flips.append(flipped)
+                assert torch.equal(poses, original * sign if flipped else original)
+                picture = images[place[t]]
+                assert torch.equal(image > 0, picture.flip(-1) if flipped else picture)
+    assert max(seen.values()) == 1 and TRAIN - len(seen) < batch_size * world
+    assert 0.25 < np.mean(flips) < 0.75
+
+
+def test_the_number_of_workers_changes_the_order_alone(dataset: Path) -> None:
+    epochs = [[b["template"].tolist() for b in TrainingStream(dataset, 5, num_workers=n)] for n in (0, 1, 2)]
+    assert epochs[0] == epochs[1] != epochs[2]
+    assert sorted(epochs[0]) == sorted(epochs[2])
+
+
+def test_a_stream_depends_on_seed_epoch_and_rank(dataset: Path) -> None:
+    def epoch(number: int, seed: int = 0, rank: int = 0) -> list[Any]:
+        stream = TrainingStream(
+            dataset, 8, seed=seed, mirror=True, samples_per_epoch=96, epoch=lambda: number, place=lambda: (rank, 2)
+        )
+        assert len(stream) == 6
+        return [(b["template"].tolist(), b["poses"].numpy().tobytes()) for b in stream]
+
+    assert epoch(1) == epoch(1)
+    others = [epoch(2), epoch(1, seed=1), epoch(1, rank=1)]
+    assert all(epoch(1) != other for other in others)
+
+
+def test_epochs_of_another_length_are_cut_from_one_row_of_passes(dataset: Path) -> None:
+    whole = TrainingStream(dataset, 16, seed=5)
+    cut = TrainingStream(dataset, 16, seed=5, samples_per_epoch=50)
+    assert len(whole) == 4 and len(cut) == 3
+    assert templates([b for _ in range(4) for b in cut]) == templates([b for _ in range(3) for b in whole])
+
+
+def test_buckets_hold_like_with_like_and_no_more_padding_than_they_must(dataset: Path) -> None:
+    batches = list(TrainingStream(dataset, 4, bucket_by_blocks=True))
+    assert len(batches) == TRAIN // 4
+    for batch in batches:
+        assert batch["mask"].any(0).all() and batch["poses"].shape[1] == batch["mask"].shape[1]
+    mixed = [len(set(batch["mask"].sum(1).tolist())) - 1 for batch in batches]
+    windows = -(-len(batches) // 4)  # of 16 samples
+    lengths = 7  # 4 to 10 blocks
+    assert sum(mixed) <= windows * (lengths - 1)
+    everyone = list(TrainingStream(dataset, 4))
+    assert sorted(templates(batches)) == sorted(templates(everyone))
+    assert sum(b["mask"].numel() for b in batches) < 0.8 * sum(b["mask"].numel() for b in everyone)
+
+
+def test_reading_leaves_the_random_numbers_of_the_model_alone(dataset: Path) -> None:
+    torch.manual_seed(0)
+    list(TrainingStream(dataset, 8, mirror=True))
+    list(ExactStream(dataset, "validation", 8))
+    after = torch.rand(3)
+    torch.manual_seed(0)
+    assert torch.equal(after, torch.rand(3))
+
+
+# Resumed.
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("length", [None, 90])
+def test_a_resumed_epoch_goes_on_with_the_next_sample(dataset: Path, workers: int, length: int | None) -> None:
+    def stream() -> TrainingStream:
+        return TrainingStream(
+            dataset,
+            4,
+            num_workers=workers,
+            bucket_by_blocks=True,
+            mirror=True,
+            samples_per_epoch=length,
+            epoch=lambda: 3,
+        )
+
+    def shown(batches: Any) -> list[Any]:
+        return [(b["template"].tolist(), b["poses"].numpy().tobytes()) for b in batches]
+
+    whole = shown(stream())
+    for stop in (1, 7, len(whole)):
+        first, second = stream(), stream()
+        begun = shown(islice(first, stop))
+        second.load_state_dict(json.loads(json.dumps(first.state_dict())))
+        assert len(second) == len(whole) and not second.relaid
+        assert begun + shown(second) == whole
+
+
+@pytest.mark.parametrize(("worlds"), [(2, 1), (1, 3), (2, 3, 1)])
+def test_on_another_number_of_processes_no_finished_window_is_read_again(
+    dataset: Path, worlds: tuple[int, ...]
+) -> None:
+    state, seen, again = None, Counter[int](), 0
+    for turn, world in enumerate(worlds):
+        streams = [
+            TrainingStream(dataset, 4, place=partial(_place, rank, world), epoch=lambda: 2) for rank in range(world)
+        ]
+        for stream in streams:
+            if state is not None:
+                stream.load_state_dict(state)
+                assert stream.relaid
+        assert len({len(stream) for stream in streams}) == 1
+        stop = 5 if turn < len(worlds) - 1 else None
+        lengths = set()
+        for stream in streams:
+            batches = list(islice(stream, stop))
+            lengths.add(len(batches))
+            seen.update(templates(batches))
+        assert len(lengths) == 1
+        again += world * 16  # a window for each reader that may be begun and not finished
+        state = streams[0].state_dict()
+    assert seen.total() - len(seen) <= again
+    assert max(seen.values()) <= len(worlds)
+    assert TRAIN - len(seen) < 4 * worlds[-1]
+
+
+# What cannot be read.
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_damaged_shard_is_named_and_counted_and_takes_no_batch_away(damaged: Path, workers: int) -> None:
+    data = StackDataModule(damaged, batch_size=8, mode="stream", num_workers=workers)
+    with said() as lines:
+        batches = list(data.train_dataloader())
+    assert len(batches) == TRAIN // 8 and all(len(batch["template"]) == 8 for batch in batches)
+    assert set(templates(batches)) <= set(range(41, 71))  # not one from the shard whose checksum is wrong
+    assert len(lines) == 2
+    assert "train-000000.tar is damaged: cut short or altered, its checksum is not the one" in lines[0]
+    assert lines[1] == "data: samples skipped in epoch 0: 41"
+
+
+def test_damage_is_reported_in_every_epoch_and_named_in_the_first(damaged: Path) -> None:
+    stream = TrainingStream(damaged, 8)
+    with said() as lines:
+        for _ in range(3):
+            list(stream)
+    assert "train-000000.tar is damaged" in lines[0]
+    assert lines[1:] == [f"data: samples skipped in epoch {number}: 41" for number in range(3)]
+
+
+def test_one_flipped_bit_costs_the_shard_and_leaves_nothing_to_validate(damaged: Path) -> None:
+    with said() as lines, pytest.raises(StackgenError, match="0 readable samples cannot be shared by 1 processes"):
+        list(StackDataModule(damaged, mode="stream").val_dataloader())
+    assert len(lines) == 1 and "validation-000002.tar is damaged" in lines[0]
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+def test_broken_samples_are_skipped_named_and_counted(faulty: Path, workers: int) -> None:
+    data = StackDataModule(faulty, batch_size=8, mode="stream", num_workers=workers)
+    with said() as lines:
+        training = list(data.train_dataloader())
+        validation = list(data.val_dataloader())
+    assert len(training) == TRAIN // 8 and all(torch.isfinite(batch["poses"]).all() for batch in training)
+    assert 45 not in templates(training)
+    assert templates(validation) == [t for t in range(71, 94) if t not in (71, 80)]
+    assert lines == [
+        "data: skipped a broken sample of train-000001.tar, 0000045: "
+        "poses that are not finite, or shapes beyond the catalogue",
+        "data: samples skipped in epoch 0: 1",
+        "data: skipped a broken sample of validation-000002.tar, 0000080: "
+        "a packed silhouette of size (32, 4), not of 64 pixels square",
+        "data: skipped a broken sample of validation-000002.tar, 0000071: "
+        "poses that are not finite, or shapes beyond the catalogue",
+        "data: samples skipped in the validation split: 2",
+    ]
+
+
+def test_memory_skips_and_names_the_same_samples(faulty: Path) -> None:
+    with said() as lines:
+        found = load_dataset(faulty)[0]
+    assert found["train"].template.tolist() == [t for t in range(71) if t != 45]
+    assert found["validation"].template.tolist() == [t for t in range(71, 94) if t not in (71, 80)]
+    assert len(lines) == 4 and lines[-1] == f"data: samples skipped in {faulty}: 3"
+
+
+def test_memory_refuses_a_damaged_shard(damaged: Path) -> None:
+    for split, file in (("train", r"train-000000\.tar"), ("validation", r"validation-000002\.tar")):
+        with pytest.raises(StackgenError, match=rf"{file} is damaged.*`stackgen dataset repair`") as caught:
+            load_dataset(damaged, (split,))
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("lost", [{4}, {0, 1, 2}, {22}, {20, 21, 22}, set(range(1, 20)), set(range(5, 23))])
+@pytest.mark.parametrize("batch_size", [1, 3, 8])
+def test_losses_leave_processes_with_equally_many_validation_batches(
+    dataset: Path, samples: dict[str, list[Sample]], tmp_path: Path, lost: set[int], batch_size: int
+) -> None:
+    those = list(samples["validation-000002.tar"])
+    for i in lost:
+        those[i] = replace(those[i], poses=those[i].poses * np.nan)
+    folder = copy_of(dataset, tmp_path / "lossy", validation_000002=those)
+    with said() as lines:
+        shares = [
+            [b["template"].tolist() for b in ExactStream(folder, "validation", batch_size, place=partial(_place, rank))]
+            for rank in range(3)
+        ]
+    assert len({len(share) for share in shares}) == 1
+    assert all(1 <= len(batch) <= batch_size + 2 for share in shares for batch in share)
+    together = sorted(t for share in shares for batch in share for t in batch)
+    assert together == [71 + i for i in range(VALIDATION) if i not in lost]
+    assert lines[-1] == f"data: samples skipped in the validation split: {len(lost)}"  # by one of the three
+    assert sum("samples skipped in" in line for line in lines) == 1
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_dataset_without_a_readable_sample_is_an_error_and_not_an_endless_wait(
+    dataset: Path, tmp_path: Path, workers: int
+) -> None:
+    folder = tmp_path / "empty"
+    shutil.copytree(dataset, folder)
+    for path in folder.glob("train-*.tar"):
+        path.write_bytes(b"nothing")
+    with said() as lines, pytest.raises(StackgenError, match="no readable sample in any shard") as caught:
+        list(TrainingStream(folder, 8, num_workers=workers))
+    assert "\n" not in str(caught.value)
+    assert sum("is damaged" in line for line in lines) == 2
+
+
+def test_after_many_unreadable_shards_in_a_row_it_gives_up(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = copy_of(dataset, tmp_path / "gone")
+    (folder / "train-000000.tar").unlink()
+    (folder / "train-000001.tar").unlink()
+    monkeypatch.setattr(streaming, "HOPELESS", 2)
+    with said(), pytest.raises(StackgenError, match=r"2 shards in a row cannot be read; .*there is no file"):
+        list(TrainingStream(folder, 8))
+
+
+def test_a_shard_that_holds_fewer_samples_than_the_manifest_says_is_reported(
+    dataset: Path, samples: dict[str, list[Sample]], tmp_path: Path
+) -> None:
+    folder = copy_of(dataset, tmp_path / "short", validation_000002=samples["validation-000002.tar"][:20])
+    manifest = Manifest.load(folder)
+    entries = [{**entry, "samples": 23} if entry["split"] == "validation" else entry for entry in manifest.shards]
+    replace(manifest, shards=tuple(entries)).save(folder)
+    with said() as lines:
+        assert len(templates(ExactStream(folder, "validation", 8))) == 20
+    assert lines[-1] == "data: samples skipped in the validation split: 3"
+    with said() as lines:
+        assert len(load_dataset(folder, ("validation",))[0]["validation"]) == 20
+    assert lines == [
+        "data: validation-000002.tar lacks 3 of the samples that dataset.json says it has",
+        f"data: samples skipped in {folder}: 3",
+    ]
+
+
+def test_a_shard_that_holds_more_samples_than_the_manifest_says_is_refused(dataset: Path, tmp_path: Path) -> None:
+    folder = copy_of(dataset, tmp_path / "long")
+    manifest = Manifest.load(folder)
+    replace(manifest, shards=tuple({**entry, "samples": 20} for entry in manifest.shards)).save(folder)
+    with pytest.raises(StackgenError, match=r"validation-000002\.tar holds more samples than dataset\.json says"):
+        load_dataset(folder, ("validation",))

@@ -1,0 +1,91 @@
+"""The program: poses in the controller's base, balanced blocks of text, within the limits, for both kinds of jaws."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stackgen.errors import StackgenError
+from stackgen.robot.backend import Close, Open
+from stackgen.robot.planning.motion import Motion, joint_motion
+from stackgen.robot.real.gripper import Gripper
+from stackgen.robot.real.program import Controller, controller_move, controller_pose, tool_offset
+from stackgen.robot.real.urscript import urscript
+from tests.robot.real import standin
+from tests.robot.real.arms import CELL, plan
+
+NUMBERS = r"\[([^\]]*)\]"
+
+
+def program(**gripper: object) -> str:
+    return urscript(plan(), CELL, Controller(), Gripper(**gripper))  # type: ignore[arg-type]
+
+
+def motions() -> list[Motion]:
+    found = [action for step in plan().blocks for action in step.actions if isinstance(action, Motion)]
+    return [*found, *([plan().homing] if plan().homing else [])]  # type: ignore[list-item]
+
+
+def test_the_controllers_base_is_the_urdfs_turned_by_half_a_turn() -> None:
+    """Against the arm's published Denavit-Hartenberg table, which is written in the controller's base."""
+    random, tool = np.random.default_rng(0), np.array(tool_offset(CELL))
+    for joints in random.uniform(-np.pi, np.pi, (20, 6)):
+        ours = standin.matrix(controller_pose(joints, CELL))
+        np.testing.assert_allclose(ours, standin.forward(joints, tool), atol=1e-7)
+
+
+def test_every_motion_is_a_line_that_leads_to_its_end() -> None:
+    lines = [line for line in program().splitlines() if re.match(r"  move[jl]\(.*#", line)]
+    assert len(lines) == len(motions())
+    for line, motion in zip(lines, motions(), strict=True):
+        assert line.strip().startswith("movej(get_inverse_kin(p[" if motion.kind == "joint" else "movel(p[")
+        pose = np.array([float(word) for word in re.findall(NUMBERS, line)[0].split(",")])
+        wanted = controller_pose(motion.end, CELL)
+        np.testing.assert_allclose(standin.matrix(pose), standin.matrix(wanted), atol=2e-6)
+        speed = float(re.findall(r" v=([\d.]+)", line)[0])
+        assert 0 < speed <= (np.radians(CELL.speeds.joint) if motion.kind == "joint" else CELL.speeds.line) + 1e-3
+
+
+def test_every_block_is_taken_let_go_and_named() -> None:
+    text = program()
+    actions = [action for step in plan().blocks for action in step.actions]
+    assert len(re.findall(r"^  jaws_close\(\d+\)$", text, re.M)) == sum(isinstance(a, Close) for a in actions)
+    assert len(re.findall(r"^  jaws_open\(\d+\)$", text, re.M)) == sum(isinstance(a, Open) for a in actions)
+    assert len(re.findall(r"^  jaws_must_hold\(\)$", text, re.M)) == len(plan().blocks)
+    assert "Block 0 (cube): from slot 1" in text and "Block 1 (triangle): from slot 2" in text
+
+
+@pytest.mark.parametrize("kind", ["robotiq", "digital"])
+def test_every_block_of_text_is_ended_and_nothing_is_left_to_fill_in(kind: str) -> None:
+    text = program(kind=kind)
+    code = [line.strip() for line in text.splitlines() if line.strip() and not line.strip().startswith("#")]
+    opened = sum(bool(re.match(r"(def|if|while) ?.*:$", line)) for line in code)
+    assert opened == sum(line == "end" for line in code) > 5
+    assert code[0] == "def stackgen_build():" and code[-1] == "end"
+    assert "@" not in text
+    assert ("socket_open" in text) == (kind == "robotiq")
+
+
+def test_a_digital_output_has_the_level_that_was_asked_for() -> None:
+    text = program(kind="digital", output=3, closed=False)
+    opens = text[text.index("def jaws_open") : text.index("def jaws_close")]
+    closes = text[text.index("def jaws_close") :]
+    assert "set_standard_digital_out(3, True)" in opens
+    assert "set_standard_digital_out(3, False)" in closes
+
+
+def test_a_motion_out_of_the_workspace_is_refused_by_block_and_place() -> None:
+    high = (0.55, 0.40, 0.12)
+    low_ceiling = replace(CELL, workspace=replace(CELL.workspace, high=high))
+    with pytest.raises(StackgenError, match=r"block 0 \(cube\): .* outside cell.workspace"):
+        urscript(plan(), low_ceiling, Controller(), Gripper())
+
+
+def test_a_motion_that_is_too_fast_is_refused() -> None:
+    motion = joint_motion("transit", CELL.home_joints, CELL.home_joints + 0.3, CELL.speeds)
+    assert motion is not None
+    slow = replace(CELL, speeds=replace(CELL.speeds, joint=10.0))
+    with pytest.raises(StackgenError, match="transit would be too fast"):
+        controller_move(motion, slow)
+    assert controller_move(motion, CELL).speed <= np.radians(CELL.speeds.joint)

@@ -1,0 +1,387 @@
+"""Laws of statics: contact patches, tipping and sliding angles, symmetries, and the simulator's opinion."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+from scipy.spatial import ConvexHull
+from scipy.spatial.transform import Rotation
+
+from stackgen.data.shards import Manifest
+from stackgen.errors import StackgenError
+from stackgen.geometry import centers_of_mass, mirror
+from stackgen.io.stacks_file import read_stacks
+from stackgen.sim.physics import Physics
+from stackgen.sim.statics.checker import EquilibriumChecker
+from stackgen.sim.statics.contacts import GROUND, Contact, find_contacts
+from stackgen.sim.statics.programs import inradius
+from stackgen.stack import Stack
+from stackgen.world import Catalogue, Shape
+from tests.conftest import Cli, stacks_json
+
+CUBE, RECTANGLE, LONG, TRIANGLE = range(4)
+TESTSET = Path(__file__).parents[3] / "stackgen" / "assets" / "testset-v1"
+FREE = EquilibriumChecker(safety=0)
+"""Takes all that could stand."""
+
+
+def stack(*blocks: tuple[int, float, float], yaw: float = 0) -> Stack:
+    """Blocks of (shape, x, z), turned about the vertical through the origin."""
+    shapes = [shape for shape, _, _ in blocks]
+    return turned(Stack(np.array(shapes), np.array([[x, 0, z, 0, 0, 0] for _, x, z in blocks], dtype=float)), yaw)
+
+
+def turned(upright: Stack, yaw: float, shift: tuple[float, float] = (0, 0)) -> Stack:
+    """The whole stack turned about the vertical and moved on the ground."""
+    turn = Rotation.from_rotvec([0, 0, yaw])
+    poses = upright.poses.copy()
+    poses[:, :3] = turn.apply(poses[:, :3]) + [*shift, 0]
+    poses[:, 3:] = (turn * Rotation.from_rotvec(upright.poses[:, 3:])).as_rotvec()
+    return upright.with_poses(poses)
+
+
+def slope(stack: Stack, friction: float = 0.5) -> float:
+    """Tangent of the margin."""
+    return math.tan(EquilibriumChecker(Physics(friction=friction), safety=0).equilibrium(stack).margin)
+
+
+def settled_stacks(number: int, start: int = 0) -> list[Stack]:
+    """Some of the frozen test set."""
+    manifest = Manifest.load(TESTSET)
+    samples = list(manifest.samples(TESTSET, "test"))[start : start + number]
+    return [sample.stack(manifest.catalogue) for sample in samples]
+
+
+def without(whole: Stack, block: int) -> Stack:
+    """A stack less one block."""
+    keep = np.arange(len(whole)) != block
+    return Stack(whole.shapes[keep], whole.poses[keep], whole.catalogue)
+
+
+# Contacts.
+
+
+def area(contact: Contact) -> float:
+    """Of the patch [cell^2]."""
+    along = contact.points @ np.stack([contact.tangent, np.cross(contact.normal, contact.tangent)], axis=1)
+    return float(ConvexHull(along).volume)
+
+
+def one_contact(pair: Stack, tolerance: float = 0.02) -> Contact:
+    """The one patch between two blocks."""
+    (contact,) = [c for c in find_contacts(pair, tolerance) if c.by != GROUND]
+    return contact
+
+
+@pytest.mark.parametrize("d", [0.0, 0.3, -0.7])
+@pytest.mark.parametrize("yaw", [0.0, 0.4])
+def test_patch_of_displaced_cubes_is_their_overlap(d: float, yaw: float) -> None:
+    contact = one_contact(stack((CUBE, 0, 0.5), (CUBE, d, 1.5), yaw=yaw))
+    assert area(contact) == pytest.approx(1 - abs(d))
+    assert (contact.block, contact.by) == (1, 0)
+    np.testing.assert_allclose(contact.normal, [0, 0, 1], atol=1e-12)
+    np.testing.assert_allclose(contact.points[:, 2], 1)
+
+
+def test_patch_of_a_cube_turned_by_an_eighth_is_an_octagon() -> None:
+    poses = np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, np.pi / 4]])
+    contact = one_contact(Stack(np.array([CUBE, CUBE]), poses))
+    assert len(contact.points) == 8
+    assert area(contact) == pytest.approx(2 * (math.sqrt(2) - 1))
+
+
+@pytest.mark.parametrize(("gap", "touch"), [(-0.05, True), (0.0, True), (0.019, True), (0.021, False)])
+def test_faces_touch_up_to_the_tolerance(gap: float, touch: bool) -> None:
+    contacts = find_contacts(stack((CUBE, 0, 0.5), (CUBE, 0, 1.5 + gap)), 0.02)
+    assert len(contacts) == 1 + touch
+
+
+def test_a_slightly_tilted_block_touches_as_far_as_the_tolerance_goes() -> None:
+    tilt = 0.05
+    poses = np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1 + 0.5 * (math.cos(tilt) + math.sin(tilt)), 0, tilt, 0]])
+    contact = one_contact(Stack(np.array([CUBE, CUBE]), poses))
+    assert np.ptp(contact.points[:, 0]) == pytest.approx(0.02 / math.tan(tilt), rel=0.01)
+
+
+def test_a_block_on_a_slope_touches_it_along_its_normal() -> None:
+    up = np.array([2, 0, 1]) / math.sqrt(5)  # out of the triangle's right face
+    middle = np.array([0.25, 0, 0.5])
+    center = middle + up / 2
+    poses = np.array([[0, 0, 0.5, 0, 0, 0], [*center, 0, math.atan2(up[0], up[2]), 0]])
+    contact = one_contact(Stack(np.array([TRIANGLE, CUBE]), poses))
+    np.testing.assert_allclose(np.abs(contact.normal @ up), 1)
+    assert area(contact) == pytest.approx(1)
+
+
+def test_an_apex_touches_along_a_line_and_neighbours_side_by_side() -> None:
+    apex = one_contact(stack((TRIANGLE, 0, 0.5), (CUBE, 0.2, 1.5)))
+    assert len(apex.points) == 2 and np.ptp(apex.points, axis=0) == pytest.approx([0, 1, 0])
+    side = one_contact(stack((CUBE, 0, 0.5), (CUBE, 1.01, 0.5)))
+    assert abs(side.normal[0]) == pytest.approx(1) and area(side) == pytest.approx(1)
+
+
+# The margin.
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.5, 0.9, 1.5])
+@pytest.mark.parametrize("yaw", [0.0, 0.4])
+def test_a_cube_slides_at_the_angle_of_friction_or_tips_over_its_edge(friction: float, yaw: float) -> None:
+    assert slope(stack((CUBE, 0, 0.5), yaw=yaw), friction) == pytest.approx(min(friction, 1), abs=1e-3)
+
+
+@pytest.mark.parametrize("height", [2, 3, 5])
+def test_a_tower_tips_when_its_centre_of_mass_leaves_its_foot(height: int) -> None:
+    tower = stack(*((CUBE, 0, i + 0.5) for i in range(height)), yaw=0.3)
+    assert slope(tower, 0.9) == pytest.approx(min(0.9, 1 / height), abs=1e-3)
+
+
+@pytest.mark.parametrize("d", [-0.45, -0.2, 0.0, 0.1, 0.3, 0.49])
+def test_an_overhang_tips_alone_or_takes_its_support_along(d: float) -> None:
+    expected = min((0.5 - abs(d)) / 0.5, (0.5 - abs(d) / 2) / 1, 0.9)
+    assert slope(stack((CUBE, 0, 0.5), (CUBE, d, 1.5)), 0.9) == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize(("d", "stands"), [(0.49, True), (0.51, False), (-0.49, True), (-0.51, False)])
+def test_an_overhang_stands_until_its_centre_of_mass_is_outside(d: float, stands: bool) -> None:
+    found = FREE.equilibrium(stack((CUBE, 0, 0.5), (CUBE, d, 1.5), yaw=0.2))
+    assert found.stable is stands
+    assert found.unheld.tolist() == [False, not stands]
+
+
+def test_the_safety_margin_separates_what_could_stand_from_what_is_called_stable() -> None:
+    marginal = stack((CUBE, 0, 0.5), (CUBE, 0.495, 1.5))  # tips at atan(0.01)
+    assert FREE.equilibrium(marginal).stable
+    for safety, stable in ((0.009, True), (0.011, False)):
+        found = EquilibriumChecker(safety=safety).equilibrium(marginal)
+        assert found.stable is stable and found.margin == pytest.approx(0.01, abs=1e-3)
+        assert found.unheld.tolist() == [False, not stable]
+        assert found.residual == 0
+
+
+def test_a_block_on_the_tail_holds_an_overhang() -> None:
+    overhang = ((CUBE, 0, 0.5), (RECTANGLE, 0.6, 1.5))
+    assert not FREE.equilibrium(stack(*overhang)).stable
+    assert FREE.equilibrium(stack(*overhang, (CUBE, 0.1, 2.5))).stable
+    assert not FREE.equilibrium(stack(*overhang, (CUBE, 0.4, 2.5))).stable  # (2 * 0.6 + 0.4) / 3 > 0.5
+
+
+def test_a_bridge_needs_both_piers() -> None:
+    bridge = stack((CUBE, -1.2, 0.5), (CUBE, 1.2, 0.5), (LONG, 0, 1.5))
+    assert FREE.equilibrium(bridge).stable
+    for pier in (0, 1):
+        assert FREE.equilibrium(without(bridge, pier)).unheld.tolist() == [False, True]
+
+
+def test_a_triangle_stands_on_a_cube_and_nothing_on_a_triangle() -> None:
+    roof = stack((CUBE, 0, 0.5), (TRIANGLE, 0, 1.5))
+    height = (1 * 0.5 + 0.5 * (1 + 1 / 3)) / 1.5  # of the common centre of mass; alone it tips at 1.5
+    assert slope(roof, 5) == pytest.approx(0.5 / height, abs=1e-3)
+    edge = stack((TRIANGLE, 0, 0.5), (RECTANGLE, 0, 1.5))
+    assert FREE.equilibrium(edge).margin < 1e-3 and not EquilibriumChecker().equilibrium(edge).stable
+    assert FREE.equilibrium(stack((TRIANGLE, 0, 0.5), (RECTANGLE, 0.1, 1.5))).unheld[1]
+
+
+@pytest.mark.parametrize("friction", [0.3, 0.7])
+@pytest.mark.parametrize("incline", [0.2, 0.4, 0.6, 0.8])
+def test_a_block_on_a_ramp_slides_beyond_the_angle_of_friction(friction: float, incline: float) -> None:
+    ramp = Shape("ramp", ((-2, -2 * incline), (2, -2 * incline), (2, 2 * incline)))
+    tile = Shape.box("tile", 1, 0.2)
+    angle = math.atan(incline)
+    pose = [-0.1 * math.sin(angle), 0, 2 * incline + 0.1 * math.cos(angle), 0, -angle, 0]
+    on_ramp = Stack(np.array([0, 1]), np.array([[0, 0, 2 * incline, 0, 0, 0], pose]), Catalogue((ramp, tile)))
+    checker = EquilibriumChecker(Physics(friction=friction), safety=0)
+    found = checker.equilibrium(on_ramp)
+    assert found.stable is (incline < friction)
+    assert checker.reasons(on_ramp, found) == ({} if incline < friction else {1: "would slide"})
+
+
+def test_neighbours_do_not_hold_a_block_by_squeezing_it() -> None:
+    towers = [(CUBE, x, z) for x in (-1, 1) for z in (0.5, 1.5, 2.5)]
+    found = FREE.equilibrium(stack(*towers, (CUBE, 0, 1.5)))
+    assert found.unheld[6] and found.residual == pytest.approx(1)
+
+
+@pytest.mark.parametrize("yaw", [0.0, 0.3])
+def test_corners_that_meet_bear_nothing(yaw: float) -> None:
+    stairs = stack((CUBE, 0, 0.5), (CUBE, 1, 1.5), yaw=yaw)
+    assert FREE.equilibrium(stairs).unheld.tolist() == [False, True]
+    assert not any(contact.supports(1) for contact in find_contacts(stairs, 0.08))
+
+
+# The push.
+
+
+def test_a_push_slides_a_cube_or_tips_it() -> None:
+    for friction, expected in ((0.5, 0.5), (2.0, 1.0)):
+        found = EquilibriumChecker(Physics(friction=friction)).equilibrium(stack((CUBE, 0, 0.5)), with_push=True)
+        assert found.push == pytest.approx(expected, abs=1e-3)
+
+
+@pytest.mark.parametrize("height", [2, 4])
+def test_a_push_at_the_top_tips_a_rough_tower(height: int) -> None:
+    tower = stack(*((CUBE, 0, i + 0.5) for i in range(height)))
+    found = EquilibriumChecker(Physics(friction=5)).equilibrium(tower, with_push=True)
+    # Pushing block j tips the whole tower, or all from some joint on: the worst is all of it, at the top,
+    # unless the top block goes over alone.
+    expected = min((height - i) * 0.5 / (height - 0.5 - i) for i in range(height))
+    assert found.push == pytest.approx(expected, abs=1e-3)
+
+
+# What is missing.
+
+
+def test_the_residual_of_a_floating_block_is_its_weight_and_its_load() -> None:
+    floating = stack((CUBE, 0, 0.5), (RECTANGLE, 0, 2.5), (TRIANGLE, 0, 3.5))
+    found = FREE.equilibrium(floating)
+    assert found.unheld.tolist() == [False, True, True]
+    assert found.residual == pytest.approx(2.5)
+    assert FREE.reasons(floating, found) == {1: "hangs in the air", 2: "loses its support, block 1"}
+
+
+def test_reasons_tell_a_tipped_block_from_one_beside_its_support() -> None:
+    beside = stack((CUBE, 0, 0.5), (LONG, 0.8, 1.5))
+    assert FREE.reasons(beside, FREE.equilibrium(beside)) == {1: "centre of mass 0.30 cells beside its support"}
+    loaded = stack((CUBE, 0, 0.5), (RECTANGLE, 0.4, 1.5), (CUBE, 1.2, 2.5))
+    reasons = FREE.reasons(loaded, FREE.equilibrium(loaded))
+    assert reasons == {1: "is tipped over by what it carries", 2: "loses its support, block 1"}
+    marginal = stack((CUBE, 0, 0.5), (CUBE, 0.49, 1.5))
+    careful = EquilibriumChecker(safety=0.1)
+    assert careful.reasons(marginal, careful.equilibrium(marginal)) == {1: "would go at a tilt of 1.1 degrees"}
+
+
+def test_no_blocks_stand_and_wrong_settings_are_named() -> None:
+    assert FREE.check(Stack(np.zeros(0, dtype=int), np.zeros((0, 6)))).stable
+    for tolerance, safety in ((0, 0), (2, 0), (0.1, -1), (0.1, 2)):
+        with pytest.raises(StackgenError, match="contact_tolerance must lie in"):
+            EquilibriumChecker(contact_tolerance=tolerance, safety=safety)
+
+
+def corner_forces_hold(whole: Stack, friction: float = 0.5) -> bool:
+    """The textbook's linear program: a force in each corner of each patch, solved by SciPy."""
+    centers, columns = centers_of_mass(whole), []
+    for contact in find_contacts(whole, FREE.contact_tolerance):
+        across = np.cross(contact.normal, contact.tangent)
+        signs = [(0, 0)] if contact.upright else [(1, 1), (1, -1), (-1, 1), (-1, -1)]
+        for point in contact.points:
+            for a, b in signs:
+                force = contact.normal + friction * (a * contact.tangent + b * across)
+                column = np.zeros((len(whole), 6))
+                column[contact.block] = np.r_[force, np.cross(point - centers[contact.block], force)]
+                if contact.by != GROUND:
+                    column[contact.by] = -np.r_[force, np.cross(point - centers[contact.by], force)]
+                columns.append(column.ravel())
+    needed = np.zeros((len(whole), 6))
+    needed[:, 2] = [whole.catalogue[shape].volume for shape in whole.shapes]
+    return bool(linprog(np.zeros(len(columns)), A_eq=np.array(columns).T, b_eq=needed.ravel()).status == 0)
+
+
+def test_forces_of_patches_exist_where_forces_at_their_corners_do() -> None:
+    rng = np.random.default_rng(2)
+    held = []
+    for whole in shaken(60):
+        noisy = whole.with_poses(whole.poses + rng.normal(0, 0.02, whole.poses.shape))
+        for one in (whole, noisy):
+            held.append(corner_forces_hold(one))
+            assert FREE.equilibrium(one).stable == held[-1]
+    assert 20 < sum(held) < 100
+
+
+# Symmetries.
+
+
+def shaken(number: int) -> list[Stack]:
+    """Settled stacks, some whole, some less a block: both verdicts occur."""
+    rng = np.random.default_rng(3)
+    return [s if i % 3 else without(s, int(rng.integers(len(s)))) for i, s in enumerate(settled_stacks(number))]
+
+
+def same(a: Stack, b: Stack, order: NDArray[np.int64] | None = None) -> None:
+    one, two = FREE.equilibrium(a), FREE.equilibrium(b)
+    assert one.stable == two.stable
+    assert one.margin == pytest.approx(two.margin, rel=0.02, abs=2e-3)
+    assert one.residual == pytest.approx(two.residual, rel=0.5, abs=1e-3)  # torques are counted along the axes
+    if one.residual and order is not None:
+        assert one.unheld[order].tolist() == two.unheld.tolist()
+
+
+def test_symmetries_do_not_change_the_verdict() -> None:
+    rng = np.random.default_rng(0)
+    verdicts = set()
+    for whole in shaken(12):
+        verdicts.add(FREE.equilibrium(whole).stable)
+        same(whole, turned(whole, 0.7, (3, -2)))
+        same(whole, mirror(whole), np.arange(len(whole)))
+        order = rng.permutation(len(whole))
+        same(whole, Stack(whole.shapes[order], whole.poses[order]), order)
+    assert verdicts == {True, False}
+
+
+def test_scale_density_and_gravity_do_not_matter() -> None:
+    other = EquilibriumChecker(replace(Physics(), cell_size=1.0, density=1.0, gravity=1.6), safety=0)
+    for whole in shaken(6):
+        assert FREE.equilibrium(whole).margin == other.equilibrium(whole).margin
+
+
+def test_what_is_not_stable_has_a_block_that_is_not_held() -> None:
+    rng = np.random.default_rng(1)
+    for whole in settled_stacks(10):
+        noisy = whole.with_poses(whole.poses + rng.normal(0, 0.1, whole.poses.shape))
+        for safety in (0, 0.05):
+            verdict = EquilibriumChecker(safety=safety).check(noisy)
+            assert verdict.stable != verdict.fell.any()
+            assert verdict.margin is not None and verdict.stable <= (verdict.margin >= safety)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_inradius_of_a_polygon_is_the_distance_of_its_nearest_side(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    corners = rng.normal(size=(12, 2)) @ rng.normal(size=(2, 2))
+    corners -= corners.mean(axis=0)
+    hull = ConvexHull(corners)
+    asked = []
+
+    def furthest(direction: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        asked.append(direction)
+        return corners[(corners @ direction).argmax()], direction
+
+    assert inradius(furthest)[0] == pytest.approx(-hull.equations[:, 2].max(), abs=1e-3)
+    assert len(asked) <= 4 + 2 * len(hull.vertices)
+
+
+# The simulator's opinion.
+
+
+def test_statics_and_simulator_agree_on_settled_stacks_and_on_what_is_left_of_them() -> None:
+    pytest.importorskip("pybullet")
+    from stackgen.sim.checkers import SimulatorChecker
+
+    rng = np.random.default_rng(5)
+    wholes = settled_stacks(50, start=100)
+    judged = wholes + [without(whole, int(rng.integers(len(whole)))) for whole in wholes]
+    simulator, statics = SimulatorChecker(until_fall=True), EquilibriumChecker()
+    truth = np.array([simulator.check(s).stable for s in judged])
+    said = np.array([statics.check(s).stable for s in judged])
+    assert 10 < (~truth).sum() < 50  # both verdicts are common
+    assert (truth == said).mean() >= 0.95
+    assert (said & ~truth).sum() <= 2
+
+
+def test_check_explains(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("pybullet")
+    monkeypatch.setenv("COLUMNS", "200")
+    file, judged = tmp_path / "stacks.json", tmp_path / "judged.json"
+    file.write_text(json.dumps(stacks_json([("cube", 0, 0.5)], [("cube", 0, 0.5), ("triangle", 0.75, 1.5)])))
+    answer = cli("check", file, "--explain", "--out", judged)
+    assert answer.code == 1
+    assert "26.6°" in answer.out and "50%" in answer.out
+    assert "block 1 (triangle): centre of mass 0.25 cells beside its support" in answer.out
+    margins = [entry.verdict and entry.verdict.margin for entry in read_stacks(judged).entries]
+    assert margins == pytest.approx([math.atan(0.5), 0.0], abs=1e-3)
+    assert "statics" not in cli("check", file).out

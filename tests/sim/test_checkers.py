@@ -1,0 +1,94 @@
+"""Accept and fell: two questions to one rollout, and the checker that asks PyBullet."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stackgen.data.generation.templates import draw_template, realize
+from stackgen.sim.checkers import AcceptLimits, SimulatorChecker, accept, fell
+from stackgen.sim.physics import Physics, engine_version
+from stackgen.sim.simulator import Rollout
+from stackgen.stack import Stack
+
+LIMITS, PHYSICS = AcceptLimits(), Physics()
+
+
+def rollout(*changes: tuple[int, float], at_rest: bool = True) -> Rollout:
+    """Of two blocks; the second ends changed: (place in the pose, by how much)."""
+    start = Stack(np.array([0, 1]), np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]]))
+    poses = start.poses.copy()
+    for place, change in changes:
+        poses[1, place] += change
+    return Rollout(start, start.with_poses(poses), at_rest, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("seen", "accepted", "fallen"),
+    [
+        (rollout(), True, False),
+        (rollout((0, 0.15), (2, -0.1)), True, False),
+        (rollout((0, 0.3)), False, False),  # slid: no data, but nothing fell
+        (rollout((1, -0.3)), False, False),
+        (rollout((2, -0.3)), False, False),  # sank by less than half a cell
+        (rollout((2, -0.51)), False, True),
+        (rollout((2, 0.3)), False, False),  # rose
+        (rollout((4, 0.2)), False, False),  # leans
+        (rollout((5, 1.0)), True, False),  # turned about the vertical
+        (rollout(at_rest=False), False, False),
+        (rollout((2, -3.0), at_rest=False), False, True),
+    ],
+)
+def test_accept_and_fell_are_different_questions(seen: Rollout, accepted: bool, fallen: bool) -> None:
+    assert accept(seen, LIMITS) is accepted
+    assert fell(seen, PHYSICS).tolist() == [False, fallen]
+
+
+def test_the_limits_are_the_limits() -> None:
+    assert accept(rollout((0, 0.5), (4, 0.5)), AcceptLimits(displacement=0.51, tilt=0.51))
+    assert not accept(rollout((0, 0.5)), AcceptLimits(displacement=0.49))
+    assert not accept(rollout((4, 0.5)), AcceptLimits(displacement=1, tilt=0.49))
+    assert fell(rollout((2, -0.2)), Physics(fall_height=0.1)).tolist() == [False, True]
+    assert not fell(rollout((2, -PHYSICS.fall_height)), PHYSICS).any()  # more than half a cell, not just half
+
+
+def test_a_stack_that_leaned_before_is_measured_from_there() -> None:
+    start = Stack(np.array([0]), np.array([[0, 0, 0.5, 0, 0.3, 0]]))
+    assert accept(Rollout(start, start, True, 1.0), LIMITS)
+    upright = start.with_poses([[0, 0, 0.5, 0, 0, 0]])
+    assert not accept(Rollout(start, upright, True, 1.0), LIMITS)
+
+
+def test_the_verdict_says_which_block_fell_and_how_far() -> None:
+    checker = SimulatorChecker()
+    poses = np.zeros((3, 6))
+    poses[:, 2], poses[2, 0] = [0.5, 1.5, 2.5], 3  # the third has nothing under it
+    verdict = checker.check(Stack(np.zeros(3, int), poses))
+    assert not verdict.stable and verdict.fell.tolist() == [False, False, True]
+    assert verdict.drop == pytest.approx([0, 0, 2], abs=0.02)
+    assert verdict.settled.poses[:, 2] == pytest.approx([0.5, 1.5, 0.5], abs=0.02)
+    assert verdict.at_rest and checker.physics == Physics()
+    good = checker.check(Stack(np.zeros(2, int), poses[:2]))
+    assert good.stable and not good.fell.any()
+
+
+def test_the_early_end_gives_the_same_verdicts() -> None:
+    rng = np.random.default_rng(1)
+    stacks = []
+    for _ in range(16):
+        stack = realize(draw_template(rng), rng)
+        keep = np.sort(rng.permutation(len(stack))[: len(stack) - 2])
+        stacks.append(Stack(stack.shapes[keep], stack.poses[keep]))
+    whole, early = SimulatorChecker(), SimulatorChecker(until_fall=True)
+    verdicts, soon = whole.check_all(stacks), early.check_all(stacks)
+    assert [v.stable for v in verdicts] == [v.stable for v in soon]
+    assert 0 < sum(v.stable for v in verdicts) < len(stacks)
+    for verdict, stack in zip(verdicts, stacks, strict=True):
+        assert verdict.stable == (not verdict.fell.any()) == bool(verdict.drop.max() <= 0.5)
+        assert (whole.check(stack).settled.poses == verdict.settled.poses).all()
+
+
+def test_the_physics_travel_with_the_engine_s_name() -> None:
+    plain = Physics(friction=0.7).to_json()
+    assert plain.pop("engine") == engine_version() and engine_version().startswith("pybullet ")
+    assert Physics(**plain) == Physics(friction=0.7)

@@ -1,0 +1,328 @@
+"""Sweeps: one file for W&B and for here, exactly the trials asked for, whatever happens to the coordinator."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+from stackgen.errors import StackgenError
+from stackgen.training.sweeps.child import command_of
+from stackgen.training.sweeps.coordinator import folder_lock, mend_journal, open_study, run_sweep
+from stackgen.training.sweeps.file import EarlyTerminate, Metric, Sweep
+from stackgen.training.sweeps.findings import ranking, write_findings
+from stackgen.training.sweeps.space import grid_of, space_of
+from stackgen.training.sweeps.telling import MetricsReader
+from tests.conftest import CHILD, Cli
+
+ROOT = Path(__file__).parents[3]
+REAL = ROOT / "configs" / "sweeps" / "ddpm.yaml"
+
+PROGRAM = """
+import json, os, sys, time
+from pathlib import Path
+values = dict(word[2:].split("=", 1) for word in sys.argv[1:])
+told = Path(os.environ["STACKGEN_METRICS"])
+with open(told.parent / "starts", "a") as file:
+    file.write(f"{os.getpid()}\\n")
+if values.get("fails") == "True":
+    sys.exit("no luck")
+for step in range(1, 4):
+    with told.open("a") as file:
+        file.write(json.dumps({"step": step, "loss": (float(values["x"]) - 3) ** 2 + 1 / step}) + "\\n")
+    time.sleep(float(values.get("nap", 0)))
+(told.parent / "done").touch()
+"""
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Path:
+    path = tmp_path / "program.py"
+    path.write_text(PROGRAM)
+    return path
+
+
+def sweep_of(program: Path, **options: Any) -> Sweep:
+    """A sweep over x whose loss is least at 3."""
+    given: dict[str, Any] = {
+        "parameters": {"x": {"min": 0, "max": 7}},
+        "metric": Metric("loss"),
+        "command": ["${interpreter}", "${program}", "${args}"],
+        "method": "random",
+        "name": "toy",
+        **options,
+    }
+    return Sweep(str(program), **given)
+
+
+def states(folder: Path, sweep: Sweep) -> list[str]:
+    return [row.state for row in sorted(ranking(open_study(sweep, folder)), key=lambda row: row.trial)]
+
+
+def starts(folder: Path) -> list[int]:
+    """How often each trial's program was started."""
+    return [len(path.read_text().split()) for path in sorted(folder.glob("trials/*/starts"))]
+
+
+def test_parameters_of_wandb_are_distributions_of_optuna() -> None:
+    found = space_of(
+        {
+            "a": {"values": [1, "x", True, None]},
+            "b": {"min": 1, "max": 5},
+            "c": {"min": 1.0, "max": 5},
+            "d": {"distribution": "log_uniform_values", "min": 0.01, "max": 1},
+            "e": {"distribution": "log_uniform", "min": 0, "max": 1},
+            "f": {"distribution": "q_uniform", "min": 0, "max": 1, "q": 0.25},
+            "g": {"parameters": {"h": {"distribution": "q_log_uniform_values", "min": 1, "max": 64}}},
+            "constant": {"value": 3},
+        }
+    )
+    assert found == {
+        "a": CategoricalDistribution([1, "x", True, None]),
+        "b": IntDistribution(1, 5),
+        "c": FloatDistribution(1, 5),
+        "d": FloatDistribution(0.01, 1, log=True),
+        "e": FloatDistribution(1, 2.718281828459045, log=True),
+        "f": FloatDistribution(0, 1, step=0.25),
+        "g.h": IntDistribution(1, 64, log=True),
+    }
+    assert grid_of({"f": found["f"], "b": found["b"]}) == {"f": [0, 0.25, 0.5, 0.75, 1], "b": [1, 2, 3, 4, 5]}
+
+
+@pytest.mark.parametrize(
+    ("parameter", "word"),
+    [
+        ({"vales": [1]}, "vales"),
+        ({"min": 1}, "give value, values, or min and max"),
+        ({"distribution": "beta", "min": 0, "max": 1}, "'beta' is not one of uniform"),
+        ({"distribution": "log_uniform_values", "min": 0, "max": 1}, "low"),
+        ({"values": [{"a": 1}]}, "as text"),
+        ({"distribution": "int_uniform", "min": 0.5, "max": 1}, "whole numbers"),
+    ],
+)
+def test_a_parameter_that_is_not_understood_is_named(parameter: dict[str, Any], word: str) -> None:
+    with pytest.raises(StackgenError, match=f"parameter x.*{word}"):
+        space_of({"x": parameter})
+
+
+def test_a_sweep_ends_with_the_best_configuration_and_pictures(
+    cli: Cli, program: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    sweep = sweep_of(program, run_cap=8, parameters={"x": {"min": 0, "max": 7}, "y.z": {"value": 2}})
+    Path("toy.yaml").write_text(sweep.to_yaml())
+    answer = cli("sweep", "--config", "toy.yaml", "--parallel", 2)
+    assert answer.code == 0, answer.err
+    folder = Path("runs/sweeps/toy")
+    with (folder / "leaderboard.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    losses = [float(row["loss"]) for row in rows]
+    assert len(rows) == 8 and losses == sorted(losses)
+    assert all(float(row["loss"]) == pytest.approx((int(row["x"]) - 3) ** 2 + 1 / 3, rel=1e-5) for row in rows)
+    assert yaml.safe_load((folder / "best.yaml").read_text()) == {"x": int(rows[0]["x"]), "y": {"z": 2}}
+    for name in ("slices.png", "importance.png"):
+        assert (folder / name).read_bytes().startswith(b"\x89PNG")
+    assert f"optuna-dashboard {folder}/journal.log" in answer.out
+    again = cli("sweep", "--config", "toy.yaml", "--run_cap", 9)  # one more, of the same sweep
+    assert again.code == 0 and len(states(folder, sweep)) == 9
+    assert starts(folder) == [1] * 9
+    other = cli("sweep", "--config", "toy.yaml", "--metric.goal", "maximize")
+    assert other.code == 2 and "another metric" in other.line
+
+
+def test_a_grid_is_visited_once(program: Path, tmp_path: Path) -> None:
+    sweep = sweep_of(program, method="grid", parameters={"x": {"values": [0, 1, 2]}, "z": {"min": 4, "max": 5}})
+    study = run_sweep(sweep, tmp_path / "out", parallel=3, tell=lambda line: None)
+    assert sorted((row.values["x"], row.values["z"]) for row in ranking(study)) == [
+        (x, z) for x in (0, 1, 2) for z in (4, 5)
+    ]
+
+
+def test_bad_trials_are_given_up_and_their_programs_end(program: Path, tmp_path: Path) -> None:
+    parameters = {"x": {"values": [3, 4, 5, 6, 7, 8]}, "nap": {"value": 0.4}}
+    stop = EarlyTerminate(min_iter=1, eta=2)
+    sweep = sweep_of(program, method="grid", parameters=parameters, early_terminate=stop)
+    folder = tmp_path / "out"
+    study = run_sweep(sweep, folder, tell=lambda line: None)
+    rows = ranking(study)
+    assert rows[0].values["x"] == 3 and rows[0].state == "complete"
+    given_up = [row for row in rows if row.state == "pruned"]
+    assert given_up and min(row.values["x"] for row in given_up) > 3
+    assert len(given_up) + sum(row.state == "complete" for row in rows) == 6
+    for row in rows:
+        assert (folder / f"trials/{row.trial:04d}/done").exists() == (row.state == "complete")
+
+
+def test_an_interrupted_sweep_goes_on_with_the_same_trials(program: Path, tmp_path: Path) -> None:
+    sweep, folder = (
+        sweep_of(program, run_cap=5, parameters={"x": {"min": 0, "max": 7}, "nap": {"value": 0.1}}),
+        tmp_path,
+    )
+    lines: list[str] = []
+
+    def interrupt(line: str) -> None:
+        lines.append(line)
+        if len(lines) == 1:  # the other trial may have ended too, but nobody has heard of it
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        run_sweep(sweep, folder, 2, tell=interrupt)
+    before = {trial.number: trial.params for trial in open_study(sweep, folder).trials}
+    assert states(folder, sweep).count("complete") == 1 and states(folder, sweep).count("running") >= 1
+    study = run_sweep(sweep, folder, 2, tell=lines.append)
+    assert states(folder, sweep) == ["complete"] * 5
+    assert "were interrupted and begin again" in lines[1]
+    assert {n: study.trials[n].params for n in before} == before
+    assert sum(starts(folder)) <= 5 + 2
+
+
+def test_a_folder_has_one_coordinator(program: Path, tmp_path: Path) -> None:
+    with folder_lock(tmp_path), pytest.raises(StackgenError, match="is in use"):
+        run_sweep(sweep_of(program), tmp_path)
+
+
+def test_a_program_that_always_fails_ends_the_sweep_with_its_last_words(program: Path, tmp_path: Path) -> None:
+    parameters = {"x": {"min": 0, "max": 7}, "fails": {"value": True}}
+    sweep = sweep_of(program, parameters=parameters)
+    with pytest.raises(StackgenError, match=r"3 trials in a row failed.*no luck"):
+        run_sweep(sweep, tmp_path / "out", tell=lambda line: None)
+    assert states(tmp_path / "out", sweep) == ["fail"] * 3
+    with pytest.raises(StackgenError, match=r"no trial of .* ran to its end"):
+        write_findings(open_study(sweep, tmp_path / "out"), sweep, tmp_path / "out")
+
+
+def test_a_journal_that_was_cut_off_is_mended(program: Path, tmp_path: Path) -> None:
+    sweep = sweep_of(program, run_cap=2)
+    run_sweep(sweep, tmp_path, tell=lambda line: None)
+    journal = tmp_path / "journal.log"
+    whole = journal.read_bytes()
+    journal.write_bytes(whole + b'{"op_code": 4, "wor')
+    mend_journal(journal)
+    assert journal.read_bytes() == whole
+    assert states(tmp_path, sweep) == ["complete"] * 2
+
+
+def test_only_whole_lines_are_heard(tmp_path: Path) -> None:
+    reader = MetricsReader(tmp_path / "told", "loss")
+    assert list(reader.new()) == []
+    (tmp_path / "told").write_text('{"loss": 2}\nnoise\n{"other": 1}\n{"lo')
+    assert list(reader.new()) == [2]
+    with (tmp_path / "told").open("a") as file:
+        file.write('ss": 1}\n')
+    assert list(reader.new()) == [1]
+
+
+def test_the_macros_of_wandb_are_filled_in(program: Path, tmp_path: Path) -> None:
+    sweep = replace(sweep_of(program), command=["${env}", "${interpreter}", "a", "${args_no_hyphens}"])
+    assert command_of(sweep, {"x.y": 1, "z": None}, tmp_path) == [sys.executable, "a", "x.y=1", "z=null"]
+    fit = replace(sweep, command=["stackgen", "fit", "${args}"])
+    words = command_of(fit, {"x": True}, tmp_path)
+    assert words[:5] == [sys.executable, "-m", "stackgen", "fit", "--x=True"]
+    assert f"--trainer.default_root_dir={tmp_path}" in words
+    with pytest.raises(StackgenError, match="is not one of"):
+        command_of(replace(sweep, command=["${args_json}"]), {}, tmp_path)
+
+
+def test_what_is_exported_is_the_file(cli: Cli) -> None:
+    answer = cli("sweep", "--config", REAL, "--export_wandb")
+    assert answer.code == 0, answer.err
+    assert yaml.safe_load(answer.out) == yaml.safe_load(REAL.read_text())
+
+
+def test_every_parameter_of_the_real_sweep_is_an_option_of_fit(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(ROOT)
+    content = yaml.safe_load(REAL.read_text())
+    sweep = Sweep(**{**content, "metric": Metric(**content["metric"]), "early_terminate": EarlyTerminate(min_iter=1)})
+    space = space_of(sweep.parameters)
+    assert sweep.run_cap is not None and sweep.run_cap >= 30
+    values = {n: d.choices[-1] if isinstance(d, CategoricalDistribution) else d.low for n, d in space.items()}  # type: ignore[attr-defined]
+    words = command_of(sweep, values, tmp_path)
+    answer = cli(*words[3:], "--print_config")
+    assert answer.code == 0, answer.err
+    config = yaml.safe_load(answer.out)
+    assert config["model"]["init_args"]["schedule"]["kind"] == "cosine"
+    assert config["model"]["init_args"]["diffusion"]["guidance"] == 1.0
+    assert config["name"] == "run"
+
+
+@pytest.mark.slow
+def test_a_killed_coordinator_leaves_nobody_behind_and_goes_on_with_exactly_its_trials(
+    program: Path, tmp_path: Path
+) -> None:
+    parameters = {"x": {"min": 0, "max": 7}, "nap": {"value": 0.3}}
+    sweep, folder = sweep_of(program, run_cap=9, method="bayes", parameters=parameters), tmp_path / "out"
+    (tmp_path / "toy.yaml").write_text(sweep.to_yaml())
+    words = ["sweep", "--config", str(tmp_path / "toy.yaml"), "--out", str(folder), "--parallel", "2"]
+    for ended in (2, 5):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "stackgen", *words], env=CHILD, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        while len(list(folder.glob("trials/*/done"))) < ended:
+            assert process.poll() is None
+            time.sleep(0.02)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        pids = [int(pid) for path in folder.glob("trials/*/starts") for pid in path.read_text().split()]
+        time.sleep(0.3)
+        assert not [pid for pid in pids if alive(pid)]
+    study = run_sweep(sweep, folder, 2, tell=lambda line: None)
+    assert states(folder, sweep) == ["complete"] * 9
+    assert [json.loads(path.read_text())["x"] for path in sorted(folder.glob("trials/*/parameters.json"))] == [
+        trial.params["x"] for trial in study.trials
+    ]
+    assert sum(starts(folder)) <= 9 + 2 * 2
+
+
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that is dead and not yet buried does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+@pytest.mark.slow
+def test_a_sweep_of_fit_finds_a_configuration_that_fits(
+    cli: Cli, towers_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    base = {
+        "model": {
+            "class_path": "stackgen.models.diffusion.module.DDPM",
+            "init_args": {"denoiser": {"width": 32, "layers": 1, "heads": 2, "feedforward": 64}},
+        },
+        "data": {"path": str(towers_dataset), "batch_size": 16},
+        "trainer": {"max_epochs": 1, "callbacks": {"class_path": "stackgen.training.callbacks.EMA"}},
+    }
+    Path("base.yaml").write_text(yaml.safe_dump(base))
+    rate = "model.optimizer.learning_rate"
+    sweep = Sweep(
+        "stackgen",
+        {rate: {"values": [1e-05, 0.01]}},
+        Metric("validation/loss"),
+        method="grid",
+        command=["stackgen", "fit", "--config", "base.yaml", "${args}"],
+        name="tiny",
+    )
+    Path("tiny.yaml").write_text(sweep.to_yaml())
+    answer = cli("sweep", "--config", "tiny.yaml")
+    assert answer.code == 0, answer.err
+    best = Path("runs/sweeps/tiny/best.yaml")
+    config = yaml.safe_load(best.read_text())
+    assert config["model"]["init_args"]["optimizer"]["learning_rate"] == 0.01
+    answer = cli("fit", "--config", best, "--trainer.fast_dev_run", "true")
+    assert answer.code == 0, answer.err

@@ -1,0 +1,188 @@
+"""From the photo of a drawing to silhouette, cells and block list."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from stackgen.commands.cli import main
+from stackgen.errors import StackgenError
+from stackgen.geometry import iou, silhouette
+from stackgen.stack import Stack
+from stackgen.vision.cells import EMPTY, FULL, TRIANGLE, block_list, in_cells, occupancy, picture_of
+from stackgen.vision.drawings import read_silhouette
+from stackgen.vision.sketches import find_sheet, read_sketch, sheet_ratio
+from stackgen.world import PAPER_CATALOGUE
+
+ROOT = Path(__file__).parents[2]
+PHOTOS = ROOT / "examples" / "photos"
+DRAWN = runpy.run_path(str(ROOT / "examples" / "draw_photos.py"))
+Photo, sheet_with, photographed = (DRAWN[name] for name in ("Photo", "sheet_with", "photographed"))
+STACKS = {name: DRAWN[name] for name in ("ARCH", "CASTLE", "HOUSE")}
+
+
+def truth(name: str) -> np.ndarray:
+    return read_silhouette(silhouette(STACKS[name]), exact=False)
+
+
+@pytest.mark.parametrize("name", STACKS)
+@pytest.mark.parametrize(
+    "photo",
+    [
+        Photo(filled=True, slant=0, turn=0, light=0),
+        Photo(filled=False, slant=0.12, turn=-8, light=0.5, seed=5),
+        Photo(filled=True, slant=0.08, turn=10, light=0.6, blur=2.0, seed=6),
+    ],
+    ids=["flat", "outline", "filled"],
+)
+def test_the_drawing_is_recovered(name: str, photo: object) -> None:
+    found = read_sketch(photographed(sheet_with(STACKS[name], photo), photo))
+    assert iou(found.silhouette, truth(name)) >= 0.9
+    assert iou(found.drawn, truth(name)) >= 0.85  # with the strokes' width and a hand's wobble
+
+
+@pytest.mark.parametrize("name", STACKS)
+def test_the_examples_show_their_stacks(name: str) -> None:
+    found = read_sketch(PHOTOS / f"sketch-{name.lower()}.jpg")
+    assert iou(found.silhouette, truth(name)) >= 0.95
+    assert found.counts is not None
+
+
+def test_a_photo_of_the_bare_sheet_needs_no_table() -> None:
+    found = read_sketch(np.repeat(sheet_with(STACKS["ARCH"], Photo())[..., None], 3, axis=2))
+    assert iou(found.silhouette, truth("ARCH")) >= 0.95
+
+
+def test_the_sheet_is_found_where_it_lies() -> None:
+    photo = np.full((600, 800, 3), (110, 85, 60), dtype=np.uint8)
+    corners = np.array([[150, 90], [640, 120], [700, 500], [90, 470]])
+    cv2.fillPoly(photo, [corners.astype(np.int32)], (235, 235, 230))
+    assert np.abs(find_sheet(photo) - corners).max() < 8
+
+
+def test_a_rectangle_seen_askew_has_its_own_proportions() -> None:
+    corners = np.array([[-1.5, -1], [1.5, -1], [1.5, 1], [-1.5, 1]])
+    lean, turn, focal = np.radians(35), np.radians(20), 700.0
+    corners = corners @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+    points = np.stack([corners[:, 0], corners[:, 1] * np.cos(lean), 6 + corners[:, 1] * np.sin(lean)], axis=1)
+    assert sheet_ratio(focal * points[:, :2] / points[:, 2:], 800.0) == pytest.approx(1.5, rel=0.02)
+
+
+def test_cells_and_their_picture_are_inverse() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        cells = rng.choice([EMPTY, FULL], (4, 4))
+        top = np.argmax(np.vstack([cells, np.zeros((1, 4), int)]) == EMPTY, axis=0)
+        cells[np.minimum(top, 3)[0], 0] = FULL
+        cells[3, 1] = TRIANGLE
+        assert np.array_equal(occupancy(picture_of(cells)), cells)
+
+
+def test_blocks_that_stick_out_of_the_grid_make_no_triangles() -> None:
+    long, cells = PAPER_CATALOGUE.index("long_rectangle"), np.array([[1, 1, 1, 0], [0, 1, 1, 1]] * 2)
+    xs = [-0.65, 0.6, -0.5, 0.6]
+    poses = np.array([[x, 0, row + 0.5, 0, 0, 0] for row, x in enumerate(xs)])
+    found = in_cells(read_silhouette(silhouette(Stack(np.full(4, long), poses)), exact=False), alike=0.85)
+    assert found is not None and found[0].tolist() == cells.tolist()
+    assert np.array_equal(found[1], picture_of(cells))
+
+
+@pytest.mark.parametrize(
+    ("row", "counts"),
+    [([1, 1, 1, 1], [1, 0, 1, 0]), ([1, 1, 0, 1], [1, 1, 0, 0]), ([0, 2, 1, 2], [1, 0, 0, 2]), ([0, 0, 0, 0], None)],
+)
+def test_the_heuristic_takes_the_longest_blocks_that_fit(row: list[int], counts: list[int] | None) -> None:
+    found = block_list(np.array([row]))
+    assert (None if found is None else found.tolist()) == counts
+
+
+def page() -> np.ndarray:
+    return np.full((600, 800), 240, dtype=np.uint8)
+
+
+def test_a_window_in_a_filled_drawing_stays_open_and_so_does_an_outlined_one() -> None:
+    filled, outlined = page(), page()
+    cv2.rectangle(filled, (250, 150), (550, 450), 40, -1)
+    cv2.rectangle(filled, (350, 250), (450, 350), 240, -1)
+    cv2.rectangle(outlined, (250, 150), (550, 450), 40, 5)
+    cv2.rectangle(outlined, (352, 252), (448, 348), 40, 5)
+    for drawing in (filled, outlined):
+        ink = read_sketch(np.repeat(drawing[..., None], 3, axis=2)).ink
+        assert not ink[len(ink) // 2, ink.shape[1] // 2] and ink.any()
+
+
+def test_a_missing_base_line_is_drawn() -> None:
+    drawing = page()
+    cv2.polylines(drawing, [np.array([[250, 450], [250, 150], [550, 150], [550, 450]])], False, 40, 6)
+    assert read_sketch(np.repeat(drawing[..., None], 3, axis=2)).silhouette.sum() > 2500
+
+
+def _several() -> np.ndarray:
+    drawing = page()
+    cv2.rectangle(drawing, (80, 200), (230, 400), 40, -1)
+    cv2.rectangle(drawing, (500, 200), (650, 400), 40, 6)
+    return drawing
+
+
+def _open() -> np.ndarray:
+    drawing = page()
+    cv2.polylines(drawing, [np.array([[250, 450], [250, 150], [550, 150]])], False, 40, 6)
+    return drawing
+
+
+def _off() -> np.ndarray:
+    drawing = page()
+    cv2.rectangle(drawing, (200, 200), (500, 700), 40, -1)
+    return drawing
+
+
+@pytest.mark.parametrize(
+    ("drawing", "said"),
+    [
+        (page(), "nothing is drawn on the sheet"),
+        (_several(), "2 drawings are on the sheet"),
+        (_open(), "the outline of the drawing is open"),
+        (_off(), "runs off the sheet"),
+    ],
+    ids=["empty", "several", "open", "off"],
+)
+def test_bad_drawings_are_one_line(
+    drawing: np.ndarray, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    noisy = drawing + np.random.default_rng(0).normal(0, 3, drawing.shape)
+    photo = tmp_path / "photo.png"
+    cv2.imwrite(str(photo), np.clip(noisy, 0, 255).astype(np.uint8))
+    assert main(["capture", "--sketch", str(photo), "--out", str(tmp_path / "out.png")]) == 2
+    error = capsys.readouterr().err
+    assert said in error and str(photo) in error and error.count("\n") == 1
+    assert not (tmp_path / "out.png").exists()
+
+
+def test_an_empty_sheet_on_a_table_in_uneven_light_is_empty() -> None:
+    photo = Photo(light=0.6)
+    with pytest.raises(StackgenError, match="nothing is drawn"):
+        read_sketch(photographed(np.full((840, 1188), 240, dtype=np.uint8), photo))
+
+
+def test_no_photo_is_named(tmp_path: Path) -> None:
+    with pytest.raises(StackgenError, match=r"no\.jpg: cannot be read"):
+        read_sketch(tmp_path / "no.jpg")
+    (tmp_path / "text.jpg").write_text("no picture")
+    with pytest.raises(StackgenError, match=r"text\.jpg: is not an image"):
+        read_sketch(tmp_path / "text.jpg")
+
+
+def test_the_command_writes_silhouette_and_overlay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "house.png"
+    cv2.imwrite(str(tmp_path / "truth.png"), truth("HOUSE").astype(np.uint8) * 255)
+    photo = str(PHOTOS / "sketch-house.jpg")
+    assert main(["capture", "--sketch", photo, "--truth", str(tmp_path / "truth.png"), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "block list by the heuristic: cube=2" in said
+    assert float(said.split("truth: ")[1]) >= 0.95
+    assert iou(read_silhouette(out), truth("HOUSE")) >= 0.95
+    assert (tmp_path / "house-overlay.png").exists()
