@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,11 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
 from stackgen.io.stacks_file import Entry, StacksFile, Weights
 from stackgen.models.diffusion.settings import SamplerConfig
-from stackgen.protocols import BlockListPredictor, Judge, StabilityChecker, StackSampler
+from stackgen.protocols import BlockListPredictor, CheckerName, StabilityChecker, StackSampler
 from stackgen.sampling.alignment import AlignedSampler
 from stackgen.stack import Stack, check_block_list, parse_block_list
 from stackgen.vision.drawings import grid_offset, read_silhouette
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
+from stackgen.world import Grid, Mask, World
 
 if TYPE_CHECKING:
     from stackgen.sampling.inventory import Inventory
@@ -39,25 +39,15 @@ DEFAULT = "default"
 """Name of the weights in the package."""
 
 
-class Trained(Protocol):
-    """What samplers and predictors read from files say of themselves."""
-
-    catalogue: Catalogue
-    grid: Grid
-    max_blocks: int
-    card: dict[str, Any]
-
-
 class Model:
     """Silhouettes to stacks.
 
     Args:
-        sampler: Proposes poses.
+        sampler: Proposes poses; its world is the model's.
         predictor: Proposes the block list where none is given: the predictor, or what loads it once
             it is needed.
-        catalogue, grid, max_blocks: The world the sampler was trained in.
         weights: Where the sampler's weights came from, for the record.
-        checker: Judges; PyBullet by default.
+        checker: Says which stacks stand; PyBullet by default.
     """
 
     def __init__(
@@ -65,19 +55,18 @@ class Model:
         sampler: StackSampler,
         predictor: BlockListPredictor | Callable[[], BlockListPredictor] | None = None,
         *,
-        catalogue: Catalogue = PAPER_CATALOGUE,
-        grid: Grid = PAPER_GRID,
-        max_blocks: int = MAX_BLOCKS,
         weights: Weights | None = None,
         checker: StabilityChecker | None = None,
     ) -> None:
         self.sampler = sampler
-        self.catalogue = catalogue
-        self.grid = grid
-        self.max_blocks = max_blocks
         self.weights = weights
         self._predictor = predictor
         self._checker = checker
+
+    @property
+    def world(self) -> World:
+        """The world that the sampler knows."""
+        return self.sampler.world
 
     def sample(
         self,
@@ -127,10 +116,10 @@ class Model:
         on_step()
         entries = []
         for stack in stacks:
-            entries.append(judge(self.checker, stack, mask, self.grid))
+            entries.append(check(self.checker, stack, mask, self.world.grid))
             on_step()
         file = self._file(tuple(entries), silhouette, mask, lists[0], blocks is None, seed, inventory)
-        return replace(file, sampler=getattr(self.sampler, "settings", None))
+        return replace(file, sampler=dict(self.sampler.settings))
 
     def sample_verified(
         self,
@@ -139,32 +128,32 @@ class Model:
         seed: int = 0,
         blocks: BlockList | None = None,
         inventory: Inventory | None = None,
-        verify: Judge = "simulator",
+        verify: CheckerName = "simulator",
         budget: Budget | None = None,
         on_step: Callable[[], None] = lambda: None,
     ) -> StacksFile:
-        """Draw many stacks, have them judged, keep the best; see stackgen.sampling.verified.
+        """Draw many stacks, check them, keep the best; see stackgen.sampling.verified.
 
         Where fewer valid stacks than asked for stand with the most likely block list, the next likely ones
         are tried; a list that was given is never changed.
 
         Args:
             silhouette, num_samples, seed, blocks, inventory: As in :meth:`sample`.
-            verify: Who judges while it draws: the `simulator`, or `statics`, which is faster.
+            verify: The checker that is asked while it draws: the `simulator`, or `statics`, which is faster.
             budget: What may be spent; 64 draws by default. With a budget of draws the same seed gives the
                 same stacks, with one of time that depends on the machine.
             on_step: As in :meth:`sample_checked`.
 
         Returns:
             As :meth:`sample_checked`, the verdicts being the simulator's in any case. Its comment says what
-            was drawn and judged, that of a stack whether nothing stable was found for it.
+            was drawn and checked, that of a stack whether nothing stable was found for it.
         """
-        from stackgen.sampling.verified import Budget, VerifiedSampler, choose_list, referee
+        from stackgen.sampling.verified import Budget, VerifiedSampler, checker_named, choose_list
 
         self._check_draw(num_samples, seed)
         mask, lists = self._scene(silhouette, blocks, inventory, top=_LISTS_TRIED)
-        checker, aligned = referee(verify, self.checker), AlignedSampler(self.sampler, self.grid)
-        sampler = VerifiedSampler(aligned, checker, budget or Budget(), self.grid, verify)
+        checker = checker_named(verify, self.checker)
+        sampler = VerifiedSampler(AlignedSampler(self.sampler), checker, budget or Budget(), verify)
         counts, choice, tried = choose_list(sampler, mask, lists, num_samples, seed)
         on_step()
         entries = []
@@ -172,11 +161,11 @@ class Model:
             if checker is self.checker:
                 entry = Entry(found.stack, found.verdict, found.front_iou if found.verdict.stable else 0.0)
             else:
-                entry = judge(self.checker, found.stack, mask, self.grid)
+                entry = check(self.checker, found.stack, mask, self.world.grid)
             entries.append(replace(entry, comment="" if found.verdict.stable else "nothing stable was found for it"))
             on_step()
         file = self._file(tuple(entries), silhouette, mask, counts, blocks is None, seed, inventory)
-        comment = f"verified by {verify}: {choice.drawn} stacks drawn, {choice.judged} judged, {choice.stable} stable"
+        comment = f"verified by {verify}: {choice.drawn} stacks drawn, {choice.checked} checked, {choice.stable} stable"
         comment += f", {tried} block lists tried" if tried > 1 else ""
         return replace(file, sampler=sampler.settings, comment=comment)
 
@@ -193,8 +182,8 @@ class Model:
         physics = getattr(self.checker, "physics", None)
         return StacksFile(
             entries,
-            self.catalogue,
-            self.grid,
+            self.world.catalogue,
+            self.world.grid,
             target=mask,
             silhouette=Path(silhouette).name if isinstance(silhouette, str | Path) else None,
             block_list=counts,
@@ -208,7 +197,7 @@ class Model:
 
     def read(self, silhouette: Silhouette) -> Mask:
         """The (H, W) silhouette in an image, scaled and placed as the model knows them."""
-        return read_silhouette(silhouette, self.grid)
+        return read_silhouette(silhouette, self.world.grid)
 
     def predict_blocks(self, silhouette: Silhouette, inventory: Inventory | None = None) -> NDArray[np.int64]:
         """(S,) the network's most likely block list for a silhouette, of those that an inventory allows."""
@@ -222,7 +211,7 @@ class Model:
         """
         from stackgen.sampling.inventory import inventory_counts
 
-        return inventory_counts(inventory, self.catalogue)
+        return inventory_counts(inventory, self.world.catalogue)
 
     def counts(self, blocks: BlockList) -> NDArray[np.int64]:
         """(S,) counts of a block list in any of its forms.
@@ -231,16 +220,18 @@ class Model:
             StackgenError: On an unknown shape, a negative or too large number of blocks.
         """
         if isinstance(blocks, str):
-            return parse_block_list(blocks, self.catalogue, self.max_blocks)
+            return parse_block_list(blocks, self.world.catalogue, self.world.max_blocks)
         if isinstance(blocks, Mapping):
-            counts = np.zeros(len(self.catalogue), dtype=np.int64)
+            counts = np.zeros(len(self.world.catalogue), dtype=np.int64)
             for name, number in blocks.items():
-                counts[self.catalogue.index(name)] = number
+                counts[self.world.catalogue.index(name)] = number
         else:
             counts = np.asarray(blocks, dtype=np.int64)
-        if counts.shape != (len(self.catalogue),):
-            raise StackgenError(f"block list: one count for each of {', '.join(self.catalogue.names)}, got {blocks!r}")
-        check_block_list(counts, self.max_blocks)
+        if counts.shape != (len(self.world.catalogue),):
+            raise StackgenError(
+                f"block list: one count for each of {', '.join(self.world.catalogue.names)}, got {blocks!r}"
+            )
+        check_block_list(counts, self.world.max_blocks)
         return counts
 
     def _scene(
@@ -252,16 +243,14 @@ class Model:
         mask = self.read(silhouette)
         if blocks is not None:
             return mask, self.counts(blocks)[None]
-        aligned = np.roll(mask, grid_offset(mask, self.grid), axis=1)
+        aligned = np.roll(mask, grid_offset(mask, self.world.grid), axis=1)
         if inventory is None:
             return mask, self.predictor.predict(aligned[None], top=top)[0]
         from stackgen.sampling.inventory import allowed_lists
 
         ranks = None if self._predictor is None else lambda: self.predictor
-        world = self.catalogue, self.grid, self.max_blocks
-        counts = self.inventory(inventory)
         try:
-            return mask, allowed_lists(aligned, counts, ranks, top, *world)
+            return mask, allowed_lists(aligned, self.inventory(inventory), self.world, ranks, top)
         except StackgenError as error:
             raise StackgenError(
                 f"{silhouette}: {error}" if isinstance(silhouette, str | Path) else str(error)
@@ -276,7 +265,7 @@ class Model:
 
     def _draw(self, mask: Mask, counts: NDArray[np.int64], num_samples: int, seed: int) -> list[Stack]:
         self._check_draw(num_samples, seed)
-        return AlignedSampler(self.sampler, self.grid).sample_batch(mask[None], counts[None], num_samples, seed)[0]
+        return AlignedSampler(self.sampler).sample_batch(mask[None], counts[None], num_samples, seed)[0]
 
     @cached_property
     def predictor(self) -> BlockListPredictor:
@@ -291,23 +280,23 @@ class Model:
 
     @cached_property
     def checker(self) -> StabilityChecker:
-        """What judges the stacks."""
+        """What says which stacks stand."""
         if self._checker is not None:
             return self._checker
         from stackgen.sim.checkers import SimulatorChecker  # training machines have no PyBullet
 
-        return SimulatorChecker(self.physics, self.catalogue)
+        return SimulatorChecker(self.physics, self.world.catalogue)
 
     @property
     def physics(self) -> Physics:
         """Of the world that the sampler was trained in."""
         from stackgen.sim.physics import Physics
 
-        dataset = getattr(self.sampler, "card", {}).get("dataset") or {}
+        dataset = self.sampler.card.get("dataset") or {}
         return Physics.of_world(dataset.get("physics"))
 
 
-def judge(checker: StabilityChecker, stack: Stack, target: Mask | None = None, grid: Grid = PAPER_GRID) -> Entry:
+def check(checker: StabilityChecker, stack: Stack, target: Mask | None, grid: Grid) -> Entry:
     """Simulate a stack; compare what then stands with a target (H, W). What falls has IoU 0 (SPEC, "IoU")."""
     verdict = checker.check(stack)
     if target is None:
@@ -323,65 +312,55 @@ def load(
     """A model from weights.
 
     Args:
-        weights: Of the sampler: a name in the package (of weights, or of a heuristic such as
+        weights: Weights of the sampler: a name in the package (of weights, or of a heuristic such as
             `brute-force`), a `.safetensors` file, a `.ckpt` of our training, or the folder of a run; or
             a sampler itself.
-        block_list_weights: Of the block-list network, likewise; read when it is first needed.
-        sampler: How a diffusion model samples, where it is not as its weights have it.
+        block_list_weights: Weights of the block-list network: a name, a file or a folder, as before; they are
+            read when they are first needed.
+        sampler: Settings by which a diffusion model samples, where they are not as its weights have them.
 
     Raises:
         StackgenError: If there are no such weights, or they are not ours.
     """
-    loaded_sampler, record = _sampler(weights, sampler)
-    catalogue, grid = getattr(loaded_sampler, "catalogue", PAPER_CATALOGUE), getattr(loaded_sampler, "grid", PAPER_GRID)
+    loaded, record = _sampler(weights, sampler)
 
     def predictor() -> BlockListPredictor:
-        from stackgen.models.weights import (
-            load_predictor,  # imports torch
-            resolve_weights,
-        )
+        from stackgen.sampling.methods import load_predictor
 
-        loaded = load_predictor(resolve_weights(block_list_weights))
-        other = cast(Trained, loaded)
-        if (other.catalogue, other.grid) != (catalogue, grid):
-            name = record.name if record else type(loaded_sampler).__name__
+        found = load_predictor(block_list_weights)
+        if found.world != loaded.world:
+            name = record.name if record else type(loaded).__name__
             raise StackgenError(
                 f"the weights {name} and {block_list_weights} were trained with different shapes or grids: "
                 "give both of one world"
             )
-        return loaded
+        return found
 
-    max_blocks = getattr(loaded_sampler, "max_blocks", MAX_BLOCKS)
-    return Model(loaded_sampler, predictor, catalogue=catalogue, grid=grid, max_blocks=max_blocks, weights=record)
+    return Model(loaded, predictor, weights=record)
 
 
 def _sampler(weights: str | Path | StackSampler, settings: SamplerConfig) -> tuple[StackSampler, Weights | None]:
     """The sampler, and the name and the hash of its weights (a heuristic's: of its settings)."""
-    if isinstance(weights, str | Path):
-        from stackgen.models.weights import (
-            load_sampler,  # imports torch
-            resolve_weights,
-        )
+    from stackgen.sampling.methods import load_sampler
 
-        file = resolve_weights(weights)
-        loaded = load_sampler(file)
-    else:
-        file, loaded = "", weights
-    card = getattr(loaded, "card", {})
-    name, digest = card.get("name", Path(file).name), card.get("sha256")
-    if file and not digest:
-        digest = hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    loaded = load_sampler(weights) if isinstance(weights, str | Path) else weights
+    name, digest = loaded.card.get("name"), loaded.card.get("sha256")
+    if isinstance(weights, str | Path) and not digest:  # a checkpoint's card knows neither
+        from stackgen.models.weights import resolve
+
+        file = resolve(weights)
+        name, digest = name or file.name, hashlib.sha256(file.read_bytes()).hexdigest()
     record = Weights(name, digest) if name and digest else None
     return _configured(loaded, name or type(loaded).__name__, settings), record
 
 
-def _configured(loaded: StackSampler, weights: str | Path, sampler: SamplerConfig) -> StackSampler:
+def _configured(loaded: StackSampler, weights: str, settings: SamplerConfig) -> StackSampler:
     """The sampler with settings, if any are given."""
-    if sampler == SamplerConfig():
+    if settings == SamplerConfig():
         return loaded
     if not hasattr(loaded, "configured"):
         raise StackgenError(f"{weights} is no diffusion model: leave the settings of the sampler out")
-    return loaded.configured(sampler)
+    return loaded.configured(settings)
 
 
 def sample(

@@ -1,19 +1,19 @@
-"""The contracts that keep the parts apart: whoever samples, predicts a block list or judges.
+"""The contracts between the parts: what samples stacks, what predicts block lists, what says whether a stack stands.
 
 Networks and heuristics answer alike, so metrics, reports and the robot never know what is behind them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.stack import Stack
-from stackgen.world import Mask
+from stackgen.world import Mask, World
 
 
 @dataclass(frozen=True)
@@ -38,12 +38,36 @@ class Verdict:
     margin: float | None = None
 
 
-Judge = Literal["simulator", "statics"]
-"""Who can be asked for verdicts by name."""
+CheckerName = Literal["simulator", "statics"]
+"""The checkers that can be asked for by name."""
+
+
+class PhysicsNumbers(Protocol):
+    """The numbers that verdicts depend on; see stackgen.sim.physics.Physics."""
+
+    @property
+    def cell_size(self) -> float: ...
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain form, for files."""
+        ...
 
 
 class StackSampler(Protocol):
-    """Silhouette and block list in, stacks out: networks and heuristics alike."""
+    """A method that turns silhouettes and block lists into stacks: a network or a heuristic.
+
+    `world` is what it knows, `settings` how it samples (for the record, as JSON allows), `card` what is known
+    about it: `kind`, `name`, `sha256`, and for trained weights the `dataset`; empty where nothing is known.
+    """
+
+    @property
+    def world(self) -> World: ...
+
+    @property
+    def settings(self) -> Mapping[str, Any]: ...
+
+    @property
+    def card(self) -> Mapping[str, Any]: ...
 
     def sample_batch(
         self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
@@ -54,16 +78,22 @@ class StackSampler(Protocol):
             silhouettes: (B, H, W) front silhouettes.
             counts: (B, S) block lists.
             num_samples: Stacks per scene.
-            seed: Same seed, same stacks.
+            seed: The same seed gives the same stacks.
         """
         ...
 
 
 class BlockListPredictor(Protocol):
-    """Silhouette in, block lists out, the most likely first."""
+    """A method that turns silhouettes into block lists, the most likely first."""
+
+    @property
+    def world(self) -> World: ...
+
+    @property
+    def card(self) -> Mapping[str, Any]: ...
 
     def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-        """The most likely block lists of each silhouette.
+        """Predict the most likely block lists of each silhouette.
 
         Args:
             silhouettes: (B, H, W).
@@ -81,14 +111,18 @@ class BlockListPredictor(Protocol):
 
 
 class StabilityChecker(Protocol):
-    """Stack in, verdict out."""
+    """A method that says whether stacks stand.
+
+    `physics` holds the numbers its verdicts depend on.
+    """
+
+    @property
+    def physics(self) -> PhysicsNumbers: ...
 
     def check(self, stack: Stack) -> Verdict:
-        """Judge one stack."""
+        """Give the verdict on one stack."""
         ...
 
-
-def check_all(checker: StabilityChecker, stacks: Sequence[Stack]) -> list[Verdict]:
-    """Judge many stacks; at once where the checker can."""
-    many = getattr(checker, "check_all", None)
-    return many(stacks) if many else [checker.check(stack) for stack in stacks]
+    def check_all(self, stacks: Iterable[Stack]) -> list[Verdict]:
+        """Give the verdicts on many stacks, in order; one after the other where a checker knows no better."""
+        return [self.check(stack) for stack in stacks]

@@ -16,7 +16,7 @@ from stackgen.baselines.upright import running_sums, span
 from stackgen.errors import StackgenError
 from stackgen.geometry import Floats
 from stackgen.stack import Stack
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
+from stackgen.world import PAPER_WORLD, Mask, World
 
 Integers = NDArray[np.int64]
 
@@ -39,7 +39,7 @@ class BruteForce(Heuristic):
         steps: Candidates along x from each start, half of them to each side.
         step: Distance between them [cell].
         penalty: What a pixel of collision costs, in pixels of the silhouette.
-        catalogue, grid, max_blocks: See Heuristic.
+        world: See Heuristic.
     """
 
     kind = "brute-force"
@@ -51,11 +51,9 @@ class BruteForce(Heuristic):
         steps: int = 20,
         step: float = 0.15,
         penalty: float = 1.0,
-        catalogue: Catalogue = PAPER_CATALOGUE,
-        grid: Grid = PAPER_GRID,
-        max_blocks: int = MAX_BLOCKS,
+        world: World = PAPER_WORLD,
     ) -> None:
-        super().__init__(catalogue, grid, max_blocks)
+        super().__init__(world)
         if not 0 <= sigma <= 1 or starts < 1 or steps < 2 or steps % 2 or step <= 0 or penalty < 0:
             raise StackgenError(
                 "brute force: sigma must lie in 0..1, starts be at least 1, steps even and at least 2, "
@@ -80,10 +78,10 @@ class BruteForce(Heuristic):
         for shape in shapes:
             x, level = self.best(shape, *self.candidates(rng), silhouette, target, taken)
             poses.append([x, 0, level + 0.5, 0, 0, 0])
-            covered = span(self.catalogue[shape], [x], level + 0.5, self.grid)
+            covered = span(self.world.catalogue[shape], [x], level + 0.5, self.world.grid)
             for row, start, stop in zip(covered.rows, covered.start[0], covered.stop[0], strict=True):
                 taken[row, start:stop] += 1
-        return Stack(np.array(shapes), np.array(poses), self.catalogue)
+        return Stack(np.array(shapes), np.array(poses), self.world.catalogue)
 
     def best(
         self, shape: int, x: Floats, level: Integers, silhouette: Mask, target: Integers, taken: Integers
@@ -99,7 +97,7 @@ class BruteForce(Heuristic):
         """
         collisions = running_sums(taken)
         spans = {
-            k: (np.flatnonzero(level == k), span(self.catalogue[shape], x[level == k], k + 0.5, self.grid))
+            k: (np.flatnonzero(level == k), span(self.world.catalogue[shape], x[level == k], k + 0.5, self.world.grid))
             for k in np.unique(level).tolist()
         }
         score = np.empty(len(x))
@@ -110,7 +108,7 @@ class BruteForce(Heuristic):
         for k, (places, covered) in spans.items():
             tied = np.flatnonzero(score[places] == score.max())
             if len(tied):
-                left, right = covered.take(tied).beside(REACH, self.grid.image_size)
+                left, right = covered.take(tied).beside(REACH, self.world.grid.image_size)
                 loose = (left.sum(free) + right.sum(free)).tolist()
                 found += [(pixels, -k, place) for pixels, place in zip(loose, x[places[tied]], strict=True)]
         _, below, place = min(found)
@@ -118,8 +116,8 @@ class BruteForce(Heuristic):
 
     def candidates(self, rng: np.random.Generator) -> tuple[Floats, Integers]:
         """Places (n,) along x [cell] and their layers (n,): the paper's x in [-3, 3], z in {1, 3, 5, 7} half cells."""
-        reach = self.grid.width / 2 - 0.5
+        reach = self.world.grid.width / 2 - 0.5
         x = rng.uniform(-reach, reach, self.starts)
-        level = rng.integers(0, self.grid.height, self.starts)
+        level = rng.integers(0, self.world.grid.height, self.starts)
         one_side = np.arange(1, self.steps // 2 + 1) * self.step
         return (x[:, None] + np.concatenate([-one_side, one_side])).ravel(), np.repeat(level, self.steps)

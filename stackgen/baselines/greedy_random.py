@@ -14,7 +14,7 @@ from stackgen.baselines.heuristic import Heuristic, section
 from stackgen.baselines.swap import swap
 from stackgen.errors import StackgenError
 from stackgen.stack import Stack, shapes_of
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
+from stackgen.world import PAPER_WORLD, Grid, Mask, World
 
 Run = tuple[float, float]
 
@@ -30,7 +30,7 @@ class GreedyRandom(Heuristic):
         sigma: Probability of the swap.
         tolerance: How much a block may be wider than its run [cell]; a run that is left over by no
             more is filled, and its block stands in its middle.
-        catalogue, grid, max_blocks: See Heuristic.
+        world: See Heuristic.
     """
 
     kind = "greedy-random"
@@ -39,15 +39,13 @@ class GreedyRandom(Heuristic):
         self,
         sigma: float = 0.6,
         tolerance: float = 0.24,
-        catalogue: Catalogue = PAPER_CATALOGUE,
-        grid: Grid = PAPER_GRID,
-        max_blocks: int = MAX_BLOCKS,
+        world: World = PAPER_WORLD,
     ) -> None:
-        super().__init__(catalogue, grid, max_blocks)
+        super().__init__(world)
         if not 0 <= sigma <= 1 or not 0 <= tolerance < 0.5:
             raise StackgenError("greedy: sigma must lie in 0..1 and tolerance in 0..0.5")
         self.sigma, self.tolerance = sigma, tolerance
-        self._sections = [section(shape) for shape in catalogue]
+        self._sections = [section(shape) for shape in world.catalogue]
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -64,8 +62,8 @@ class GreedyRandom(Heuristic):
         left = counts.copy()
         shapes: list[int] = []
         poses: list[list[float]] = []
-        for level in range(self.grid.height):
-            runs = layer_runs(silhouette, level, self.grid)
+        for level in range(self.world.grid.height):
+            runs = layer_runs(silhouette, level, self.world.grid)
             while runs:
                 run = max(runs, key=lambda r: r[1] - r[0])  # the leftmost of equal ones
                 runs.remove(run)
@@ -77,7 +75,7 @@ class GreedyRandom(Heuristic):
                 poses.append([x, 0, level + 0.5, 0, 0, 0])
                 left[shape] -= 1
                 runs = sorted([*runs, rest]) if rest else runs
-        return Stack(np.array(shapes, dtype=np.int64), np.array(poses).reshape(-1, 6), self.catalogue), left
+        return Stack(np.array(shapes, dtype=np.int64), np.array(poses).reshape(-1, 6), self.world.catalogue), left
 
     def _longest(self, left: NDArray[np.int64], run: Run) -> int | None:
         """The longest block that is left and fits."""
@@ -89,19 +87,19 @@ class GreedyRandom(Heuristic):
         begin, end = run
         if end - begin - self._sections[shape] <= self.tolerance:
             return (begin + end) / 2, None
-        width = self.catalogue[shape].size[0]
+        width = self.world.catalogue[shape].size[0]
         return begin + width / 2, (begin + width, end) if begin + width < end else None
 
     def _with_the_rest(self, structure: Stack, left: NDArray[np.int64]) -> Stack:
         """The structure, and the blocks that are left on the ground to its right, half a cell between all of them."""
         shapes, poses = list(structure.shapes), list(structure.poses)
-        edge = self.grid.width / 2
+        edge = self.world.grid.width / 2
         for shape in shapes_of(left).tolist():
-            width = self.catalogue[shape].size[0]
+            width = self.world.catalogue[shape].size[0]
             shapes.append(shape)
             poses.append(np.array([edge + 0.5 + width / 2, 0, 0.5, 0, 0, 0]))
             edge += 0.5 + width
-        return Stack(np.array(shapes), np.array(poses), self.catalogue)
+        return Stack(np.array(shapes), np.array(poses), self.world.catalogue)
 
 
 def layer_runs(silhouette: Mask, level: int, grid: Grid) -> list[Run]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stackgen.errors import StackgenError
 from stackgen.geometry import row_intervals
 from stackgen.stack import Stack, check_block_list
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask, Shape
+from stackgen.world import PAPER_WORLD, Mask, Shape, World
 
 
 class Heuristic(ABC):
@@ -26,18 +26,14 @@ class Heuristic(ABC):
     on nothing else: not on the other scenes of the batch, and not on how many samples are drawn.
 
     Args:
-        catalogue: What the counts mean.
-        grid: Scale of the silhouettes.
-        max_blocks: The longest block list it takes.
+        world: Shapes, scale of the silhouettes, and the longest block list it takes.
     """
 
     kind: str
     """Its name on the command line."""
 
-    def __init__(
-        self, catalogue: Catalogue = PAPER_CATALOGUE, grid: Grid = PAPER_GRID, max_blocks: int = MAX_BLOCKS
-    ) -> None:
-        self.catalogue, self.grid, self.max_blocks = catalogue, grid, max_blocks
+    def __init__(self, world: World = PAPER_WORLD) -> None:
+        self.world = world
 
     @abstractmethod
     def place(self, silhouette: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
@@ -66,24 +62,24 @@ class Heuristic(ABC):
         """
         if num_samples < 1:
             raise StackgenError(f"the number of samples must be at least 1, got {num_samples}")
-        size, shapes = self.grid.image_size, len(self.catalogue)
+        size, shapes = self.world.grid.image_size, len(self.world.catalogue)
         if silhouettes.ndim != 3 or silhouettes.shape[1:] != (size, size):
             raise StackgenError(f"sampling needs silhouettes (B, {size}, {size}), got {silhouettes.shape}")
         if np.shape(counts) != (len(silhouettes), shapes):
             raise StackgenError(f"sampling needs a block list (S = {shapes}) for each silhouette")
-        for shape, used in zip(self.catalogue, np.any(counts, axis=0), strict=True):
+        for shape, used in zip(self.world.catalogue, np.any(counts, axis=0), strict=True):
             if used and abs(shape.size[2] - 1) > 1e-6:
                 raise StackgenError(f"{self.kind} places shapes one cell high, not {shape.name!r}")
         scenes = []
         for picture, list_ in zip(np.asarray(silhouettes, dtype=bool), np.asarray(counts), strict=True):
-            check_block_list(list_, self.max_blocks)
+            check_block_list(list_, self.world.max_blocks)
             streams = (random_stream(seed, picture, list_, number) for number in range(num_samples))
             scenes.append([self.place(picture, list_, rng) for rng in streams])
         return scenes
 
     def _largest_first(self, counts: NDArray[np.int64]) -> list[int]:
         """Shape index of each block, the ones of most area first."""
-        order = sorted(range(len(counts)), key=lambda s: (-self.catalogue[s].volume, s))
+        order = sorted(range(len(counts)), key=lambda s: (-self.world.catalogue[s].volume, s))
         return [s for s in order for _ in range(int(counts[s]))]
 
 

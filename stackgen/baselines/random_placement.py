@@ -35,14 +35,14 @@ class RandomPlacement(Heuristic):
     def place(self, silhouette: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
         """A legal stack of the block list; the silhouette is not looked at."""
         shapes = rng.permutation(shapes_of(counts))
-        layers: list[list[Interval]] = [[] for _ in range(self.grid.height)]  # the blocks' extents
+        layers: list[list[Interval]] = [[] for _ in range(self.world.grid.height)]  # the blocks' extents
         poses = []
         for shape in shapes:
-            width = self.catalogue[int(shape)].size[0]
+            width = self.world.catalogue[int(shape)].size[0]
             x, level = self._draw(width, layers, rng)
             layers[level].append((x - width / 2, x + width / 2))
             poses.append([x, 0, level + 0.5, 0, 0, 0])
-        return Stack(shapes, np.array(poses), self.catalogue)
+        return Stack(shapes, np.array(poses), self.world.catalogue)
 
     def _draw(self, width: float, layers: list[list[Interval]], rng: np.random.Generator) -> tuple[float, int]:
         """Middle of the block [cell] and layer, uniform over the legal places; a layer is added if there are none."""
@@ -63,7 +63,7 @@ class RandomPlacement(Heuristic):
             level: Of the layer.
             layers: Extents of the blocks that stand, for each layer.
         """
-        half = max(0.0, (self.grid.width - width) / 2)
+        half = max(0.0, (self.world.grid.width - width) / 2)
         room = [(-half, half)]
         if level:
             above = union((left - width / 2, right + width / 2) for left, right in layers[level - 1])

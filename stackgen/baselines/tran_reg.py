@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import torch
-from torch import Tensor
+from typing import Any
 
-from stackgen.baselines.transformer import PoseNetwork, RegressionConfig, Trunk
+import torch
+from torch import Tensor, nn
+
+from stackgen.baselines.transformer import PoseNetwork, RegressionConfig, TransformerSampler, Trunk
 from stackgen.models.diffusion.denoiser import DenoiserConfig
-from stackgen.world import MAX_BLOCKS
+from stackgen.world import World
 
 
 class PoseRegression(PoseNetwork):
@@ -16,20 +18,16 @@ class PoseRegression(PoseNetwork):
     Args:
         transformer: Architecture, described as the denoiser's.
         regression: See RegressionConfig.
-        num_shapes: Size of the catalogue.
-        image_size: Edge of the silhouette [pixel].
-        max_blocks: N.
+        world: Shapes, size of the silhouette, and N.
     """
 
     def __init__(
         self,
         transformer: DenoiserConfig,
         regression: RegressionConfig,
-        num_shapes: int = 4,
-        image_size: int = 64,
-        max_blocks: int = MAX_BLOCKS,
+        world: World,
     ) -> None:
-        super().__init__(transformer, regression, num_shapes, image_size, max_blocks)
+        super().__init__(transformer, regression, world)
         self.trunk = Trunk(transformer, transformer.layers, conditioned=False)
 
     def forward(self, shapes: Tensor, mask: Tensor, memory: Tensor) -> Tensor:
@@ -49,3 +47,9 @@ class PoseRegression(PoseNetwork):
     def draw(self, shapes: Tensor, mask: Tensor, memory: Tensor, generator: torch.Generator) -> Tensor:
         """See PoseNetwork."""
         return self(shapes, mask, memory)
+
+
+def make_tran_reg(config: dict[str, Any], world: World) -> tuple[nn.Module, Any]:
+    """Tran-Reg of a card; see stackgen.models.weights.Maker."""
+    parts = DenoiserConfig(**config["transformer"]), RegressionConfig(**config["regression"])
+    return PoseRegression(*parts, world), TransformerSampler

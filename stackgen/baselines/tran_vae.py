@@ -8,15 +8,15 @@ from N(0, I). The paper gives the numbers of layers; latent size and weight of t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from stackgen.baselines.transformer import BlockTokens, PoseNetwork, RegressionConfig, Trunk
+from stackgen.baselines.transformer import BlockTokens, PoseNetwork, RegressionConfig, TransformerSampler, Trunk
 from stackgen.errors import StackgenError
 from stackgen.models.diffusion.denoiser import POSE, DenoiserConfig, mlp
-from stackgen.world import MAX_BLOCKS
+from stackgen.world import World
 
 
 @dataclass(frozen=True)
@@ -60,9 +60,7 @@ class PoseVAE(PoseNetwork):
         transformer: Architecture, described as the denoiser's; `layers` are those of encoder and decoder together.
         regression: See RegressionConfig.
         vae: See VAEConfig.
-        num_shapes: Size of the catalogue.
-        image_size: Edge of the silhouette [pixel].
-        max_blocks: N.
+        world: Shapes, size of the silhouette, and N.
 
     Raises:
         StackgenError: If encoder or decoder would have no layer.
@@ -73,11 +71,9 @@ class PoseVAE(PoseNetwork):
         transformer: DenoiserConfig,
         regression: RegressionConfig,
         vae: VAEConfig,
-        num_shapes: int = 4,
-        image_size: int = 64,
-        max_blocks: int = MAX_BLOCKS,
+        world: World,
     ) -> None:
-        super().__init__(transformer, regression, num_shapes, image_size, max_blocks)
+        super().__init__(transformer, regression, world)
         if not 0 < vae.encoder_layers < transformer.layers:
             raise StackgenError(
                 f"Tran-VAE: encoder_layers must leave some of the {transformer.layers} layers to the decoder, "
@@ -85,7 +81,7 @@ class PoseVAE(PoseNetwork):
             )
         self.config = vae
         d = transformer.width
-        self.encoder_blocks = BlockTokens(transformer, num_shapes, max_blocks)
+        self.encoder_blocks = BlockTokens(transformer, world)
         self.pose_embedding = mlp(POSE, d, d)
         self.encoder = Trunk(transformer, vae.encoder_layers, conditioned=False)
         self.posterior = nn.Linear(d, 2 * vae.latent)
@@ -128,3 +124,9 @@ class PoseVAE(PoseNetwork):
         """Of N(0, 1), with another tensor's type and device."""
         device = generator.device if generator is not None else like.device
         return torch.randn(size, generator=generator, device=device).to(like)
+
+
+def make_tran_vae(config: dict[str, Any], world: World) -> tuple[nn.Module, Any]:
+    """Tran-VAE of a card; see stackgen.models.weights.Maker."""
+    parts = DenoiserConfig(**config["transformer"]), RegressionConfig(**config["regression"])
+    return PoseVAE(*parts, VAEConfig(**config["vae"]), world), TransformerSampler

@@ -33,7 +33,7 @@ from stackgen.models.diffusion.denoiser import (
 )
 from stackgen.models.network_sampler import NetworkSampler
 from stackgen.stack import Stack
-from stackgen.world import MAX_BLOCKS, Mask
+from stackgen.world import Mask, World
 
 _FORBIDDEN = 1e6  # cost of giving a block another shape's pose
 
@@ -59,11 +59,13 @@ class BlockTokens(nn.Module):
 
     positions: Tensor
 
-    def __init__(self, config: DenoiserConfig, num_shapes: int, max_blocks: int) -> None:
+    def __init__(self, config: DenoiserConfig, world: World) -> None:
         super().__init__()
-        self.shape_embedding = nn.Embedding(num_shapes, config.width)
-        self.rank_embedding = nn.Embedding(max_blocks, config.width) if config.ordered else None
-        self.register_buffer("positions", sinusoids(torch.arange(max_blocks).float(), config.width), persistent=False)
+        self.shape_embedding = nn.Embedding(len(world.catalogue), config.width)
+        self.rank_embedding = nn.Embedding(world.max_blocks, config.width) if config.ordered else None
+        self.register_buffer(
+            "positions", sinusoids(torch.arange(world.max_blocks).float(), config.width), persistent=False
+        )
 
     def forward(self, shapes: Tensor) -> Tensor:
         """(B, N) indices, negative at padding, to (B, N, d)."""
@@ -139,9 +141,7 @@ class PoseNetwork(nn.Module):
     Args:
         transformer: Architecture, described as the denoiser's.
         regression: See RegressionConfig.
-        num_shapes: Size of the catalogue.
-        image_size: Edge of the silhouette [pixel].
-        max_blocks: N.
+        world: Shapes, size of the silhouette, and N.
 
     Raises:
         StackgenError: If the architecture asks for what only a denoiser has.
@@ -154,16 +154,14 @@ class PoseNetwork(nn.Module):
         self,
         transformer: DenoiserConfig,
         regression: RegressionConfig,
-        num_shapes: int = 4,
-        image_size: int = 64,
-        max_blocks: int = MAX_BLOCKS,
+        world: World,
     ) -> None:
         super().__init__()
         if transformer.self_conditioning:
             raise StackgenError("self_conditioning: only a denoiser has an earlier estimate to look at")
         self.transformer, self.regression = transformer, regression
-        self.blocks = BlockTokens(transformer, num_shapes, max_blocks)
-        self.silhouette = SilhouetteTokens(transformer, image_size)
+        self.blocks = BlockTokens(transformer, world)
+        self.silhouette = SilhouetteTokens(transformer, world.grid.image_size)
         self.head = nn.Linear(transformer.width, POSE)
         if transformer.conditioning == "cross":
             nn.init.zeros_(self.head.weight)

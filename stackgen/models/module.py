@@ -1,43 +1,62 @@
-"""What every training module shares: it learns its world from its data, and names it in its checkpoints."""
+"""What every training module shares: world, network, randomness, optimiser, and the card in its checkpoints."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from torch import Tensor
+import numpy as np
+import torch
+from torch import Tensor, nn
 
+from stackgen._lightning import pl
 from stackgen.data.shards import manifest_sha256
 from stackgen.errors import StackgenError
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid
+from stackgen.models.optimization import OptimizerConfig, configure_optimizer
+from stackgen.world import World
 
 CHECKPOINT_KEY = "stackgen"
 """Where a Lightning checkpoint holds the card of its model."""
 
 
-class WorldMixin:
-    """Catalogue, grid and N, from the DataModule or from a checkpoint; the network is built when they are known.
+class StackgenModule(pl.LightningModule):
+    """A LightningModule that learns its world from its data or a checkpoint, and builds its network then.
 
-    A module sets `kind` and `config` (plain data from which the network can be built again) and
-    implements `build`.
+    A subclass sets `kind` and implements `make`, `training_step` and `validation_step`. From `kind`, `config` and
+    `world` its network can be built again; see stackgen.models.weights.
+
+    Args:
+        config: Plain data that describes the network.
+        optimizer: Learning rate and its course.
     """
 
     kind: str
-    config: dict[str, Any]
-    catalogue: Catalogue = PAPER_CATALOGUE
-    grid: Grid = PAPER_GRID
-    max_blocks: int = MAX_BLOCKS
-    dataset: dict[str, Any] | None = None
+    world: World
+    model: nn.Module
+
+    def __init__(self, config: dict[str, Any], optimizer: OptimizerConfig = OptimizerConfig()) -> None:  # noqa: B008
+        super().__init__()
+        self.config = config
+        self.optimizer_config = optimizer
+        self.dataset: dict[str, Any] | None = None
+
+    def make(self, world: World) -> nn.Module:
+        """A new network for a world."""
+        raise NotImplementedError
+
+    def prepare(self, data: Any) -> None:
+        """Take from the training data (a StackDataModule) what a new network needs; nothing by default."""
 
     def build(self) -> None:
         """Make the network, once."""
-        raise NotImplementedError
+        if not hasattr(self, "model"):
+            self.model = self.make(self.world)
 
     def setup(self, stage: str) -> None:
-        """Called by Lightning before anything else: look at the data, build the network."""
-        data = getattr(self.trainer, "datamodule", None)  # type: ignore[attr-defined]
-        if data is not None and stage == "fit":
+        """Learn the world from the data and build the network; what a checkpoint holds is loaded later."""
+        data = getattr(self.trainer, "datamodule", None) if stage == "fit" else None
+        if data is not None:
             manifest = data.manifest
-            self.catalogue, self.grid, self.max_blocks = data.catalogue, data.grid, int(manifest["max_blocks"])
+            self.world = data.world
             self.dataset = {
                 "name": manifest["name"],
                 "sha256": manifest_sha256(manifest),
@@ -45,22 +64,30 @@ class WorldMixin:
                 "physics": manifest["physics"],
             }
         self.build()
+        if data is not None:
+            self.prepare(data)
+
+    def configure_optimizers(self) -> Any:
+        """AdamW and the course of its learning rate."""
+        return configure_optimizer(self, self.optimizer_config)
+
+    def generator_of_step(self, index: int, device: torch.device) -> torch.Generator:
+        """A generator that depends on seed, process, epoch and step alone.
+
+        So a resumed fit draws what the uninterrupted one would have, and no two processes draw the same.
+        """
+        place = (torch.initial_seed() % 2**63, self.global_rank, self.current_epoch, index)
+        seed = int(np.random.SeedSequence(place).generate_state(1, np.uint64)[0] >> 1)
+        return torch.Generator(device=device).manual_seed(seed)
 
     def log_mean(self, name: str, mean: Tensor, count: int, prog_bar: bool = False) -> None:
         """Log the mean over some samples; over batches and processes all samples count alike."""
         # As a float, because Lightning rounds down what it averages of whole numbers (its issue 21859).
-        self.log(name, mean, prog_bar=prog_bar, batch_size=float(count), sync_dist=True)  # type: ignore[attr-defined]
+        self.log(name, mean, prog_bar=prog_bar, batch_size=float(count), sync_dist=True)  # type: ignore[arg-type]
 
     def card(self) -> dict[str, Any]:
         """What is known about the weights; see stackgen.models.weights."""
-        return {
-            "kind": self.kind,
-            "config": self.config,
-            "catalogue": self.catalogue.to_json(),
-            "grid": vars(self.grid),
-            "max_blocks": self.max_blocks,
-            "dataset": self.dataset,
-        }
+        return {"kind": self.kind, "config": self.config, **self.world.to_json(), "dataset": self.dataset}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Put the card into the checkpoint."""
@@ -75,6 +102,5 @@ class WorldMixin:
         card = checkpoint.get(CHECKPOINT_KEY)
         if not isinstance(card, dict) or card.get("kind") != self.kind:
             raise StackgenError(f"the checkpoint is not one of a {type(self).__name__} of stackgen")
-        self.catalogue, self.grid = Catalogue.from_json(card["catalogue"]), Grid(**card["grid"])
-        self.max_blocks, self.dataset = card["max_blocks"], card["dataset"]
+        self.world, self.dataset = World.from_json(card), card["dataset"]
         self.build()

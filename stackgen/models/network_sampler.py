@@ -16,7 +16,7 @@ from torch import Tensor
 from stackgen.errors import StackgenError
 from stackgen.models.diffusion.denoiser import POSE
 from stackgen.stack import Stack, shapes_of
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
+from stackgen.world import Mask, World
 
 Draw = Callable[[Tensor, Tensor, Tensor, torch.Generator], Tensor]
 """Silhouettes (B, H, W), shapes (B * n, N) and their mask, to poses (B * n, N, 6) [cell, rad]."""
@@ -45,23 +45,21 @@ class NetworkSampler(Generic[M]):
     """What samplers of trained networks share: their world, and questions answered some at a time.
 
     Args:
-        model: Trained.
-        catalogue, grid, max_blocks: The world it was trained in.
+        model: The trained network.
+        world: The world it was trained in.
         card: What is known about the weights.
-        batch: Stacks made together, at most.
+        batch: How many stacks are made together, at most.
     """
 
     def __init__(
         self,
         model: M,
-        catalogue: Catalogue = PAPER_CATALOGUE,
-        grid: Grid = PAPER_GRID,
-        max_blocks: int = MAX_BLOCKS,
+        world: World,
         card: dict[str, Any] | None = None,
         batch: int = 512,
     ) -> None:
-        self.catalogue, self.grid, self.max_blocks = catalogue, grid, max_blocks
-        self.card = card or {}
+        self.world = world
+        self.card: dict[str, Any] = card or {}
         self.batch = batch
         self.model = model.eval()
 
@@ -80,7 +78,7 @@ class NetworkSampler(Generic[M]):
         generator = torch.Generator().manual_seed(seed)
         for start in range(0, len(counts), scenes):
             part = slice(start, start + scenes)
-            longest = int(totals[part].max()) if self.model.trims else self.max_blocks
+            longest = int(totals[part].max()) if self.model.trims else self.world.max_blocks
             shapes, mask = pad_shapes(counts[part], longest)
             poses = draw(
                 torch.from_numpy(np.ascontiguousarray(silhouettes[part], dtype=np.float32)).to(device),
@@ -90,19 +88,21 @@ class NetworkSampler(Generic[M]):
             )
             found = poses.double().cpu().numpy().reshape(len(shapes), num_samples, -1, POSE)
             for row, real, drawn in zip(shapes, mask, found, strict=True):
-                stacks.append([Stack(row[real], p[: real.sum()], self.catalogue) for p in drawn])
+                stacks.append([Stack(row[real], p[: real.sum()], self.world.catalogue) for p in drawn])
         return stacks
 
     def _check(self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int) -> NDArray[np.int64]:
         """(B,) number of blocks in each list."""
         if num_samples < 1:
             raise StackgenError(f"the number of samples must be at least 1, got {num_samples}")
-        size = self.grid.image_size
+        size = self.world.grid.image_size
         if silhouettes.ndim != 3 or silhouettes.shape[1:] != (size, size) or len(counts) != len(silhouettes):
             raise StackgenError(f"sampling needs silhouettes (B, {size}, {size}) and as many block lists")
         totals = np.asarray(counts).sum(axis=1)
-        if len(totals) and not (totals.min() >= 1 and totals.max() <= self.max_blocks):
-            raise StackgenError(f"this model takes 1 to {self.max_blocks} blocks, got {sorted(set(totals.tolist()))}")
+        if len(totals) and not (totals.min() >= 1 and totals.max() <= self.world.max_blocks):
+            raise StackgenError(
+                f"this model takes 1 to {self.world.max_blocks} blocks, got {sorted(set(totals.tolist()))}"
+            )
         return totals
 
 

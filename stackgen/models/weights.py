@@ -12,7 +12,7 @@ import json
 import pickle
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +21,13 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from stackgen.baselines import HEURISTICS
-from stackgen.baselines.tran_reg import PoseRegression
-from stackgen.baselines.tran_vae import PoseVAE, VAEConfig
-from stackgen.baselines.transformer import RegressionConfig, TransformerSampler
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
 from stackgen.models.block_list.network import BlockListNetwork, CNNConfig, CNNPredictor
 from stackgen.models.diffusion.denoiser import DenoiserConfig
 from stackgen.models.diffusion.network import DiffusionConfig, DiffusionSampler, PoseDiffusion
 from stackgen.models.diffusion.schedules import ScheduleConfig
-from stackgen.protocols import BlockListPredictor, StackSampler
-from stackgen.world import Catalogue, Grid
+from stackgen.world import World
 
 FORMAT = "stackgen.weights/1"
 FOLDER = Path(__file__).parents[1] / "assets" / "weights"
@@ -48,44 +43,15 @@ _DAMAGED = (
 """What zipfile and torch raise at files that are not as they were written."""
 
 
-def load_sampler(weights: str | Path = "default") -> StackSampler:
-    """The sampler that a name (of weights or of a heuristic), a `.safetensors` file or a `.ckpt` of ours stands for.
-
-    Raises:
-        StackgenError: If there is no such thing, or it holds something else.
-    """
-    if str(weights) in HEURISTICS:
-        return HEURISTICS[str(weights)]()
-    tensors, card = read_weights(weights, "sampler")
-    return _build(weights, card, tensors, _SAMPLERS, "sampler")
-
-
-def load_predictor(weights: str | Path = "default") -> BlockListPredictor:
-    """The block-list predictor that a name, a `.safetensors` file or a `.ckpt` of ours stands for.
-
-    Raises:
-        StackgenError: If there is no such thing, or it holds something else.
-    """
-    tensors, card = read_weights(weights, "predictor")
-    return _build(weights, card, tensors, _PREDICTORS, "block-list predictor")
-
-
-def role_of(weights: str | Path) -> str:
-    """`predictor` where a name, file or checkpoint of ours holds a block-list network, else `sampler`.
+def read_weights(
+    weights: str | Path, role: str = "sampler", other_names: Sequence[str] = ()
+) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """Read the tensors and the card behind a name or path; see resolve.
 
     Raises:
         StackgenError: If there is no such thing or it is damaged.
     """
-    return "predictor" if read_weights(weights)[1].get("kind") in _PREDICTORS else "sampler"
-
-
-def read_weights(weights: str | Path, role: str = "sampler") -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """Tensors and card behind a name or path; `role` says what `default` means.
-
-    Raises:
-        StackgenError: If there is no such thing or it is damaged.
-    """
-    path = resolve(weights, role)
+    path = resolve(weights, role, other_names)
     if path.suffix == ".ckpt":
         return _read_checkpoint(path)
     content = _read_bytes(path)
@@ -104,8 +70,13 @@ def read_weights(weights: str | Path, role: str = "sampler") -> tuple[dict[str, 
     return tensors, card
 
 
-def resolve(weights: str | Path, role: str = "sampler") -> Path:
-    """The file that a name or path stands for.
+def resolve(weights: str | Path, role: str = "sampler", other_names: Sequence[str] = ()) -> Path:
+    """The file that weights stand for: a name in the package, a `.safetensors` or `.ckpt` file, or a run's folder.
+
+    Args:
+        weights: Name or path.
+        role: `sampler` or `predictor`: what the name `default` means.
+        other_names: Names that the caller knows besides, for the message.
 
     Raises:
         StackgenError: If there is none; the message lists the names there are.
@@ -113,6 +84,8 @@ def resolve(weights: str | Path, role: str = "sampler") -> Path:
     if str(weights) == "default":
         weights = DEFAULTS[role]
     path = Path(weights)
+    if path.is_dir():
+        return last_checkpoint(path)
     if path.suffix in (".safetensors", ".ckpt"):
         if path.is_file():
             return path
@@ -120,9 +93,22 @@ def resolve(weights: str | Path, role: str = "sampler") -> Path:
     shipped = FOLDER / f"{weights}.safetensors"
     if path.name == str(weights) and shipped.is_file():
         return shipped
-    shipped_names = [p.stem for p in FOLDER.glob("*.safetensors")]
-    names = ", ".join(sorted([*shipped_names, *(HEURISTICS if role == "sampler" else ())])) or "none are shipped"
-    raise StackgenError(f"no weights called {weights}: give a .safetensors or .ckpt file, or a name ({names})")
+    names = ", ".join(sorted([*(p.stem for p in FOLDER.glob("*.safetensors")), *other_names])) or "none are shipped"
+    raise StackgenError(
+        f"no weights called {weights}: give a .safetensors or .ckpt file, a run folder, or a name ({names})"
+    )
+
+
+def last_checkpoint(folder: Path) -> Path:
+    """The newest `last.ckpt` of a run (all its versions) or of one version.
+
+    Raises:
+        StackgenError: If there is none.
+    """
+    found = [*folder.glob("checkpoints/last.ckpt"), *folder.glob("version_*/checkpoints/last.ckpt")]
+    if not found:
+        raise StackgenError(f"no checkpoint in {folder}: there is no version_*/checkpoints/last.ckpt in it")
+    return max(found, key=lambda path: path.stat().st_mtime)
 
 
 def write_weights(path: Path, tensors: dict[str, Tensor], card: dict[str, Any]) -> None:
@@ -184,70 +170,42 @@ def _read_bytes(path: Path) -> bytes:
         raise StackgenError(f"{path} cannot be read: {error.strerror}") from error
 
 
-def _build(
-    weights: str | Path, card: dict[str, Any], tensors: dict[str, Tensor], makers: dict[str, Any], what: str
-) -> Any:
-    if card.get("kind") not in makers:
-        raise StackgenError(f"{weights} holds weights of kind {card.get('kind')!r}, not of a {what}")
+Maker = Callable[[dict[str, Any], World], tuple[nn.Module, Callable[..., Any]]]
+"""Configuration and world of a card to an empty network, and what makes a sampler or predictor of it."""
+
+
+def build(weights: str | Path, card: dict[str, Any], tensors: dict[str, Tensor], maker: Maker) -> Any:
+    """Make the sampler or predictor that a card and its tensors describe.
+
+    Args:
+        weights: Where they come from, for messages.
+        card: See the module.
+        tensors: The state of the network.
+        maker: Of the card's kind.
+
+    Raises:
+        StackgenError: If card and tensors do not fit each other.
+    """
     try:
-        catalogue, grid, max_blocks = (
-            Catalogue.from_json(card["catalogue"]),
-            Grid(**card["grid"]),
-            int(card["max_blocks"]),
-        )
-        network, wrap = makers[card["kind"]](card["config"], catalogue, grid, max_blocks)
+        world = World.from_json(card)
+        network, wrap = maker(card["config"], world)
         network.load_state_dict(tensors)
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (StackgenError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise StackgenError(f"{weights}: card and weights do not fit together: {str(error).splitlines()[0]}") from error
-    return wrap(network, catalogue, grid, max_blocks, card)
+    return wrap(network, world, card)
 
 
-Maker = Callable[[dict[str, Any], Catalogue, Grid, int], tuple[nn.Module, Callable[..., Any]]]
-
-
-def _diffusion(config: dict[str, Any], catalogue: Catalogue, grid: Grid, max_blocks: int) -> tuple[nn.Module, Any]:
+def make_diffusion(config: dict[str, Any], world: World) -> tuple[nn.Module, Any]:
+    """The diffusion model of a card; see Maker."""
     network = PoseDiffusion(
         DenoiserConfig(**config["denoiser"]),
         ScheduleConfig(**config["schedule"]),
         DiffusionConfig(**config["diffusion"]),
-        len(catalogue),
-        grid.image_size,
-        max_blocks,
+        world,
     )
     return network, DiffusionSampler
 
 
-def _regression(config: dict[str, Any], catalogue: Catalogue, grid: Grid, max_blocks: int) -> tuple[nn.Module, Any]:
-    parts = DenoiserConfig(**config["transformer"]), RegressionConfig(**config["regression"])
-    return PoseRegression(*parts, len(catalogue), grid.image_size, max_blocks), TransformerSampler
-
-
-def _vae(config: dict[str, Any], catalogue: Catalogue, grid: Grid, max_blocks: int) -> tuple[nn.Module, Any]:
-    parts = DenoiserConfig(**config["transformer"]), RegressionConfig(**config["regression"])
-    vae = VAEConfig(**config["vae"])
-    return PoseVAE(*parts, vae, len(catalogue), grid.image_size, max_blocks), TransformerSampler
-
-
-def _cnn(config: dict[str, Any], catalogue: Catalogue, grid: Grid, max_blocks: int) -> tuple[nn.Module, Any]:
-    return BlockListNetwork(CNNConfig(**config["cnn"]), catalogue, max_blocks, grid), CNNPredictor
-
-
-_SAMPLERS: dict[str, Maker] = {"ddpm": _diffusion, "tran-reg": _regression, "tran-vae": _vae}
-_PREDICTORS: dict[str, Maker] = {"blocklist": _cnn}
-
-
-def last_checkpoint(folder: Path) -> Path:
-    """The newest `last.ckpt` of a run (all its versions) or of one version.
-
-    Raises:
-        StackgenError: If there is none.
-    """
-    found = [*folder.glob("checkpoints/last.ckpt"), *folder.glob("version_*/checkpoints/last.ckpt")]
-    if not found:
-        raise StackgenError(f"no checkpoint in {folder}: there is no version_*/checkpoints/last.ckpt in it")
-    return max(found, key=lambda path: path.stat().st_mtime)
-
-
-def resolve_weights(name: str | Path) -> str:
-    """The last checkpoint where the name is a run's folder; else the name as it is."""
-    return str(last_checkpoint(Path(name))) if Path(name).is_dir() else str(name)
+def make_block_list(config: dict[str, Any], world: World) -> tuple[nn.Module, Any]:
+    """The block-list network of a card; see Maker."""
+    return BlockListNetwork(CNNConfig(**config["cnn"]), world), CNNPredictor

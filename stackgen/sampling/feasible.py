@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from stackgen.errors import StackgenError
 from stackgen.stack import Stack
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask, Shape
+from stackgen.world import Catalogue, Grid, Mask, Shape, World
 
 VALID_IOU = 0.8
 """Front IoU from which a standing stack counts as matching the target, for valid diversity."""
@@ -18,10 +18,11 @@ VALID_IOU = 0.8
 Layout = tuple[tuple[int, ...], ...]
 
 
-def layout(stack: Stack, grid: Grid = PAPER_GRID) -> Layout:
+def layout(stack: Stack, grid: Grid) -> Layout:
     """Per-layer block lists, bottom layer first (SPEC: nearest layer of a block's centre, left to right by x).
 
-    >>> layout(Stack([0, 1, 0], [[1, 0, 0.5, 0, 0, 0], [0, 0, 1.6, 0, 0, 0], [-1, 0, 0.4, 0, 0, 0]]))
+    >>> stack = Stack([0, 1, 0], [[1, 0, 0.5, 0, 0, 0], [0, 0, 1.6, 0, 0, 0], [-1, 0, 0.4, 0, 0, 0]])
+    >>> layout(stack, Grid())
     ((0, 0), (1,), (), ())
     """
     layers = np.clip(np.floor(stack.poses[:, 2]), 0, grid.height - 1).astype(int)
@@ -35,9 +36,7 @@ displacement, settling, tilt and whole pixels do. Less than half the step betwee
 (0.5) and a cube, so that no run has two meanings."""
 
 
-def can_make(
-    silhouette: ArrayLike, counts: ArrayLike, catalogue: Catalogue = PAPER_CATALOGUE, grid: Grid = PAPER_GRID
-) -> bool:
+def can_make(silhouette: ArrayLike, counts: ArrayLike, world: World) -> bool:
     """Whether a block list can make a silhouette, its blocks lying in rows of cells.
 
     At half height of each row the silhouette is cut into runs of pixels; the blocks of the list must
@@ -48,24 +47,22 @@ def can_make(
     Args:
         silhouette: (H, W).
         counts: (S,) block list.
-        catalogue: Of shapes one cell high.
-        grid: Scale of the silhouette.
+        world: With shapes one cell high.
 
     Raises:
         StackgenError: If a shape of the list is not one cell high.
     """
     wanted = tuple(int(c) for c in np.asarray(counts))
-    return wanted in lists_that_make(silhouette, wanted, catalogue, grid)
+    return wanted in lists_that_make(silhouette, wanted, world)
 
 
-def lists_that_make(
-    silhouette: ArrayLike, limit: ArrayLike, catalogue: Catalogue = PAPER_CATALOGUE, grid: Grid = PAPER_GRID
-) -> set[tuple[int, ...]]:
+def lists_that_make(silhouette: ArrayLike, limit: ArrayLike, world: World) -> set[tuple[int, ...]]:
     """All block lists of at most `limit` (S,) of each shape that can make a silhouette; see :func:`can_make`."""
     most = tuple(int(c) for c in np.asarray(limit))
-    sections = tuple(cross_section(shape) if c else (np.inf, True) for shape, c in zip(catalogue, most, strict=True))
+    shapes = zip(world.catalogue, most, strict=True)
+    sections = tuple(cross_section(shape) if c else (np.inf, True) for shape, c in shapes)
     used = {(0,) * len(most)}
-    for left, right in (run for row in row_runs(np.asarray(silhouette, dtype=bool), grid) for run in row):
+    for left, right in (run for row in row_runs(np.asarray(silhouette, dtype=bool), world.grid) for run in row):
         fillings = _fillings(round(right - left, 9), sections)
         sums = {tuple(a + b for a, b in zip(u, f, strict=True)) for u in used for f in fillings}
         used = {s for s in sums if all(a <= b for a, b in zip(s, most, strict=True))}
@@ -90,7 +87,7 @@ def cross_section(shape: Shape) -> tuple[float, bool]:
     return float(np.ptp(x)), bool(np.ptp(x) < width - 1e-6)
 
 
-def row_runs(silhouette: Mask, grid: Grid = PAPER_GRID) -> list[list[tuple[float, float]]]:
+def row_runs(silhouette: Mask, grid: Grid) -> list[list[tuple[float, float]]]:
     """For each row of cells, from the ground up, the runs of pixels at half height: their ends in x [cell]."""
     z, x = grid.vertical("front"), grid.horizontal()
     half = 0.5 / grid.pixels_per_cell

@@ -17,7 +17,7 @@ from stackgen.errors import StackgenError
 from stackgen.protocols import BlockListPredictor
 from stackgen.sampling.feasible import lists_that_make
 from stackgen.stack import format_block_list, parse_block_list
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
+from stackgen.world import Catalogue, Mask, World
 
 Inventory = str | Mapping[str, int] | NDArray[np.int64]
 """`"cube=4,rectangle=3"`, `{"cube": 4, "rectangle": 3}` or counts (S,) in catalogue order."""
@@ -29,13 +29,13 @@ _RANKED = 64  # lists that the network is asked for; what can be made but is not
 _SLACK = 0.5  # area that a silhouette may be larger than its blocks [cell]: displacement, gaps, whole pixels
 
 
-def inventory_counts(inventory: Inventory, catalogue: Catalogue = PAPER_CATALOGUE) -> NDArray[np.int64]:
+def inventory_counts(inventory: Inventory, catalogue: Catalogue) -> NDArray[np.int64]:
     """(S,) counts of an inventory in any of its forms.
 
     Raises:
         StackgenError: On an unknown shape, a negative number, or no block at all.
 
-    >>> inventory_counts("cube=40, triangle=1").tolist()
+    >>> inventory_counts("cube=40, triangle=1", PAPER_CATALOGUE).tolist()
     [40, 0, 0, 1]
     """
     try:
@@ -58,11 +58,9 @@ def inventory_counts(inventory: Inventory, catalogue: Catalogue = PAPER_CATALOGU
 def allowed_lists(
     silhouette: Mask,
     inventory: NDArray[np.int64],
+    world: World,
     predictor: Callable[[], BlockListPredictor] | None = None,
     top: int = 1,
-    catalogue: Catalogue = PAPER_CATALOGUE,
-    grid: Grid = PAPER_GRID,
-    max_blocks: int = MAX_BLOCKS,
 ) -> NDArray[np.int64]:
     """The block lists that an inventory allows and that can make a silhouette, the most likely first.
 
@@ -72,10 +70,9 @@ def allowed_lists(
     Args:
         silhouette: (H, W), on the cells of the grid.
         inventory: (S,) counts.
+        world: Shapes, grid and most blocks of a stack.
         predictor: Makes what ranks lists; None for a model without.
         top: How many lists, at most.
-        catalogue, grid: The world.
-        max_blocks: Of one stack.
 
     Returns:
         (T, S), at least one.
@@ -83,13 +80,13 @@ def allowed_lists(
     Raises:
         StackgenError: If the inventory cannot make the silhouette; the message says what is missing.
     """
-    limit = np.minimum(inventory, max_blocks)
-    _check_area(silhouette, inventory, catalogue, grid, max_blocks)
-    fitting = _fitting(silhouette, limit, catalogue, grid, max_blocks)
+    limit = np.minimum(inventory, world.max_blocks)
+    _check_area(silhouette, inventory, world)
+    fitting = _fitting(silhouette, limit, world)
     if not fitting and fitting is not None:
-        others = _fitting(silhouette, np.full(len(catalogue), max_blocks), catalogue, grid, max_blocks)
+        others = _fitting(silhouette, np.full(len(world.catalogue), world.max_blocks), world)
         if others:
-            raise StackgenError(_what_is_missing(inventory, others, catalogue))
+            raise StackgenError(_what_is_missing(inventory, others, world.catalogue))
     if predictor is None:
         if not fitting:
             raise StackgenError("this model predicts no block lists, and none was found for this silhouette: give one")
@@ -101,26 +98,23 @@ def allowed_lists(
     return np.array([*known, *_fewest_first(fitting - set(known))][:top])
 
 
-def _fitting(
-    silhouette: Mask, limit: NDArray[np.int64], catalogue: Catalogue, grid: Grid, max_blocks: int
-) -> set[tuple[int, ...]] | None:
+def _fitting(silhouette: Mask, limit: NDArray[np.int64], world: World) -> set[tuple[int, ...]] | None:
     """Block lists that can make the silhouette; None where that cannot be told for these shapes."""
     try:
-        found = lists_that_make(silhouette, limit, catalogue, grid)
+        found = lists_that_make(silhouette, limit, world)
     except StackgenError:
         return None
-    return {counts for counts in found if sum(counts) <= max_blocks}
+    return {counts for counts in found if sum(counts) <= world.max_blocks}
 
 
 def _fewest_first(lists: set[tuple[int, ...]]) -> list[tuple[int, ...]]:
     return sorted(lists, key=lambda counts: (sum(counts), counts))
 
 
-def _check_area(
-    silhouette: Mask, inventory: NDArray[np.int64], catalogue: Catalogue, grid: Grid, max_blocks: int
-) -> None:
+def _check_area(silhouette: Mask, inventory: NDArray[np.int64], world: World) -> None:
     """Raise StackgenError if all the blocks together cannot cover the silhouette."""
-    wanted = float(np.count_nonzero(silhouette)) / grid.pixels_per_cell**2
+    catalogue, max_blocks = world.catalogue, world.max_blocks
+    wanted = float(np.count_nonzero(silhouette)) / world.grid.pixels_per_cell**2
     areas = np.repeat([shape.area for shape in catalogue], np.minimum(inventory, max_blocks))
     largest = float(np.sort(areas)[::-1][:max_blocks].sum())
     if wanted - largest <= _SLACK:

@@ -1,7 +1,7 @@
-"""Verified sampling: draw, judge, keep the best.
+"""Verified sampling: draw many stacks, check them, keep the best.
 
-What the paper measures is the first stack that comes out. Whoever has a judge at hand may draw more than
-is asked for and keep what stands and matches. That is another question, so its figures are a row of their own.
+The paper measures the first stack that comes out. With a checker at hand one may draw more than is asked
+for and keep what stands and matches. That is another question, so its metrics are a row of their own.
 
 Legend: B scenes, n stacks asked for, S shapes, H x W pixels.
 """
@@ -12,7 +12,7 @@ import math
 import re
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
-from stackgen.protocols import Judge, StabilityChecker, StackSampler, Verdict, check_all
+from stackgen.protocols import CheckerName, StabilityChecker, StackSampler, Verdict
 from stackgen.sampling.feasible import VALID_IOU, Layout, layout
 from stackgen.stack import Stack
-from stackgen.world import PAPER_GRID, Grid, Mask
+from stackgen.world import Grid, Mask, World
 
 MATCH = 0.95
 """Front IoU from which a standing stack is good enough to stop looking for a better one."""
@@ -78,11 +78,11 @@ class Budget:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A stack that was drawn and judged.
+    """A stack that was drawn and checked.
 
     Args:
         stack: As drawn.
-        verdict: The judge's.
+        verdict: What the checker says.
         front_iou: Of the settled stack with the target; of an unstable one as it was drawn.
         layout: Of the stack as drawn.
     """
@@ -115,13 +115,13 @@ class Choice:
     Args:
         chosen: n candidates, the best first.
         drawn: Stacks drawn.
-        judged: Of them, how many the judge was asked about.
+        checked: Of them, how many the checker was asked about.
         stable: Of those, how many it says will stand.
     """
 
     chosen: tuple[Candidate, ...]
     drawn: int
-    judged: int
+    checked: int
     stable: int
 
     @property
@@ -159,27 +159,27 @@ class _Search:
     wanted: int
     drawn: int = 0
     queue: list[tuple[Stack, Layout]] = field(default_factory=list)
-    judged: list[Candidate] = field(default_factory=list)
+    checked: list[Candidate] = field(default_factory=list)
 
     @property
     def missing(self) -> int:
         """Matching stacks that are not found yet."""
-        return max(0, self.wanted - sum(candidate.matches for candidate in self.judged))
+        return max(0, self.wanted - sum(candidate.matches for candidate in self.checked))
 
     def add(self, stacks: Sequence[Stack], grid: Grid) -> None:
-        """Queue new draws: layouts not judged yet first, among equals the one that looks most like the target."""
+        """Queue new draws: layouts not checked yet first, among equals the one that looks most like the target."""
         alike = [silhouette_iou(stack, self.target, grid=grid) for stack in stacks]
         order = sorted(range(len(stacks)), key=lambda i: -alike[i])
         layouts = [layout(stacks[i], grid) for i in order]
-        judged = Counter(candidate.layout for candidate in self.judged)
-        again = [judged[kind] + before for kind, before in zip(layouts, _repetitions(layouts), strict=True)]
+        checked = Counter(candidate.layout for candidate in self.checked)
+        again = [checked[kind] + before for kind, before in zip(layouts, _repetitions(layouts), strict=True)]
         urgency = [again[place] if alike[i] >= MATCH else math.inf for place, i in enumerate(order)]
         places = sorted(range(len(order)), key=lambda place: urgency[place])
         self.queue = [(stacks[order[place]], layouts[place]) for place in places]
         self.drawn += len(stacks)
 
     def take(self) -> list[tuple[Stack, Layout]]:
-        """The next draws to be judged: as many as are missing."""
+        """The next draws to be checked: as many as are missing."""
         number = self.missing
         taken, self.queue = self.queue[:number], self.queue[number:]
         return taken
@@ -187,12 +187,12 @@ class _Search:
     def keep(self, stack: Stack, verdict: Verdict, kind: Layout, grid: Grid) -> None:
         """Add a verdict."""
         shown = verdict.settled if verdict.stable else stack
-        self.judged.append(Candidate(stack, verdict, silhouette_iou(shown, self.target, grid=grid), kind))
+        self.checked.append(Candidate(stack, verdict, silhouette_iou(shown, self.target, grid=grid), kind))
 
     def choice(self) -> Choice:
         """What it came to."""
-        stable = sum(candidate.verdict.stable for candidate in self.judged)
-        return Choice(best(self.judged, self.wanted), self.drawn, len(self.judged), stable)
+        stable = sum(candidate.verdict.stable for candidate in self.checked)
+        return Choice(best(self.checked, self.wanted), self.drawn, len(self.checked), stable)
 
 
 class _Clock:
@@ -214,35 +214,34 @@ class _Clock:
         return self.seconds is None or now - self.began + larger * last <= self.seconds
 
 
-def referee(judge: Judge, simulator: StabilityChecker) -> StabilityChecker:
-    """Who judges while verified sampling draws: the simulator itself, or statics with its friction.
+def checker_named(name: CheckerName, simulator: StabilityChecker) -> StabilityChecker:
+    """The checker that verified sampling asks while it draws: the simulator, or statics with its physics.
 
     Raises:
-        StackgenError: If there is no such judge.
+        StackgenError: If there is no such checker.
     """
-    if judge == "simulator":
+    if name == "simulator":
         return simulator
-    if judge == "statics":
+    if name == "statics":
         from stackgen.sim.statics.checker import EquilibriumChecker  # loads a solver that nothing else needs
 
-        return EquilibriumChecker(getattr(simulator, "physics", None))
-    raise StackgenError(f"verify: stacks are judged by simulator or statics, not {judge!r}")
+        return EquilibriumChecker(simulator.physics)  # type: ignore[arg-type]
+    raise StackgenError(f"verify: the checker is simulator or statics, not {name!r}")
 
 
 class VerifiedSampler:
-    """A StackSampler that asks another for more than is wanted, has them judged and keeps the best.
+    """A StackSampler that asks another for more than is wanted, has them checked and keeps the best.
 
     It draws in rounds until a scene has as many stacks that match as are wanted, or the budget is spent.
-    Within a round new layouts are judged first, so the stacks it keeps differ where they can. The block
+    Within a round new layouts are checked first, so the stacks it keeps differ where they can. The block
     list is the one it is given; where nothing stands it answers with the best of what falls, since a
     sampler must answer: `choose` says which is which.
 
     Args:
-        sampler: Draws.
-        checker: Judges.
+        sampler: Draws the stacks.
+        checker: Says which stand.
         budget: For each scene; time is shared by the scenes of a batch.
-        grid: Scale of the silhouettes.
-        name: Of the judge, for the record.
+        name: The checker's name, for the record.
     """
 
     def __init__(
@@ -250,17 +249,25 @@ class VerifiedSampler:
         sampler: StackSampler,
         checker: StabilityChecker,
         budget: Budget = Budget(),
-        grid: Grid = PAPER_GRID,
         name: str = "",
     ) -> None:
-        self.sampler, self.checker, self.budget, self.grid, self.name = sampler, checker, budget, grid, name
-        self.card: dict[str, Any] = getattr(sampler, "card", {})
+        self.sampler, self.checker, self.budget, self.name = sampler, checker, budget, name
+
+    @property
+    def world(self) -> World:
+        """The world of the sampler that draws."""
+        return self.sampler.world
+
+    @property
+    def card(self) -> Mapping[str, Any]:
+        """The card of the sampler that draws."""
+        return self.sampler.card
 
     @cached_property
     def settings(self) -> dict[str, Any]:
         """How it samples, for the record."""
         spent = {"draws": self.budget.draws} if self.budget.seconds is None else {"seconds": self.budget.seconds}
-        return {**getattr(self.sampler, "settings", {}), "verify": self.name or type(self.checker).__name__, **spent}
+        return {**self.sampler.settings, "verify": self.name or type(self.checker).__name__, **spent}
 
     def sample_batch(
         self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
@@ -290,20 +297,20 @@ class VerifiedSampler:
             fresh = int(np.random.SeedSequence([seed, turn]).generate_state(1, np.uint64)[0] >> 1)
             batch = self.sampler.sample_batch(silhouettes[open_], np.asarray(counts)[open_], number, fresh)
             for i, stacks in zip(open_, batch, strict=True):
-                searches[i].add(stacks, self.grid)
+                searches[i].add(stacks, self.world.grid)
             drawn += number
-            self._judge([searches[i] for i in open_], clock)
+            self._check([searches[i] for i in open_], clock)
         return [search.choice() for search in searches]
 
-    def _judge(self, searches: Sequence[_Search], clock: _Clock) -> None:
-        """Judge what is queued, of each scene only as many as it still misses, until nothing is missing."""
+    def _check(self, searches: Sequence[_Search], clock: _Clock) -> None:
+        """Check what is queued, of each scene only as many as it still misses, until nothing is missing."""
         while True:
             wave = [(search, *item) for search in searches for item in search.take()]
             if not wave:
                 return
-            verdicts = check_all(self.checker, [stack for _, stack, _ in wave])
+            verdicts = self.checker.check_all([stack for _, stack, _ in wave])
             for (search, stack, kind), verdict in zip(wave, verdicts, strict=True):
-                search.keep(stack, verdict, kind, self.grid)
+                search.keep(stack, verdict, kind, self.world.grid)
             if clock.over:
                 return
 
@@ -316,7 +323,7 @@ def choose_list(
     Every list has the whole number of draws; of the time each has half of what is left, the last all of it.
 
     Args:
-        sampler: Draws, judges and has a budget.
+        sampler: Draws, checks and has a budget.
         silhouette: (H, W).
         lists: (T, S), the most likely first.
         num_samples: n.
@@ -334,10 +341,10 @@ def choose_list(
             if tried and left <= 0:
                 break
             budget = replace(budget, seconds=max(1e-9, left if number == len(lists) else left / 2))
-        part = VerifiedSampler(sampler.sampler, sampler.checker, budget, sampler.grid)
+        part = VerifiedSampler(sampler.sampler, sampler.checker, budget)
         tried.append(part.choose(silhouette[None], counts[None], num_samples, seed)[0])
         if tried[-1].valid == num_samples:
             break
     number = max(range(len(tried)), key=lambda i: (tried[i].valid, tried[i].chosen[0].rank))
-    drawn, judged, stable = (sum(getattr(choice, name) for choice in tried) for name in ("drawn", "judged", "stable"))
-    return lists[number], Choice(tried[number].chosen, drawn, judged, stable), len(tried)
+    drawn, checked, stable = (sum(getattr(choice, name) for choice in tried) for name in ("drawn", "checked", "stable"))
+    return lists[number], Choice(tried[number].chosen, drawn, checked, stable), len(tried)

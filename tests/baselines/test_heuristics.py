@@ -16,7 +16,7 @@ from stackgen.data.datamodule import TESTSET
 from stackgen.errors import StackgenError
 from stackgen.evaluation.protocol import load_scenes
 from stackgen.io.stacks_file import read_stacks
-from stackgen.models.weights import load_sampler
+from stackgen.sampling.methods import load_sampler
 from stackgen.stack import Stack
 from stackgen.world import Mask
 from tests.conftest import Cli, TinyWeights

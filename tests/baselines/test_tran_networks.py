@@ -24,6 +24,7 @@ from stackgen.baselines.transformer import (
 )
 from stackgen.errors import StackgenError
 from stackgen.models.diffusion.denoiser import Denoiser, DenoiserConfig, raster_order, sinusoids
+from stackgen.world import PAPER_WORLD
 
 PAPER = DenoiserConfig(width=16, layers=3, heads=2, feedforward=24)
 CROSS = replace(PAPER, conditioning="cross", memory_layers=1, mask_padding=True, ordered=True)
@@ -44,11 +45,11 @@ def weighted(network: Any) -> Any:
 
 
 def regression(config: DenoiserConfig = CROSS, target: RegressionConfig = RASTER) -> PoseRegression:
-    return weighted(PoseRegression(config, target))
+    return weighted(PoseRegression(config, target, PAPER_WORLD))
 
 
 def vae(config: DenoiserConfig = CROSS, target: RegressionConfig = RASTER) -> PoseVAE:
-    return weighted(PoseVAE(config, target, VAE))
+    return weighted(PoseVAE(config, target, VAE, PAPER_WORLD))
 
 
 def batch_of(lengths: tuple[int, ...] = (7, 5, 6, 3), blocks: int = BLOCKS) -> dict[str, Tensor]:
@@ -82,14 +83,20 @@ def size(module: torch.nn.Module) -> int:
 def test_tran_reg_is_the_denoiser_without_noisy_poses_and_time() -> None:
     """The paper: the same number of layers and heads, the same widths."""
     with torch.device("meta"):
-        denoiser, network = Denoiser(DenoiserConfig()), PoseRegression(DenoiserConfig(), RASTER)
+        denoiser, network = (
+            Denoiser(DenoiserConfig(), PAPER_WORLD),
+            PoseRegression(DenoiserConfig(), RASTER, PAPER_WORLD),
+        )
     without = size(denoiser.pose_embedding) + size(denoiser.time_embedding)
     assert size(network) == size(denoiser) - without
 
 
 def test_tran_vae_has_two_and_four_of_the_layers() -> None:
     with torch.device("meta"):
-        denoiser, network = Denoiser(DenoiserConfig()), PoseVAE(DenoiserConfig(), RASTER, VAEConfig())
+        denoiser, network = (
+            Denoiser(DenoiserConfig(), PAPER_WORLD),
+            PoseVAE(DenoiserConfig(), RASTER, VAEConfig(), PAPER_WORLD),
+        )
     assert (len(network.encoder.layers), len(network.decoder.layers)) == (2, 4)
     assert size(network.encoder) + size(network.decoder) == size(denoiser.layers)
 
@@ -97,7 +104,7 @@ def test_tran_vae_has_two_and_four_of_the_layers() -> None:
 @pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
 def test_the_trunk_computes_what_the_denoiser_s_layers_do(config: DenoiserConfig) -> None:
     """With the same weights; the condition is to it what time is to the denoiser."""
-    denoiser = weighted(Denoiser(replace(config, ordered=False)))
+    denoiser = weighted(Denoiser(replace(config, ordered=False), PAPER_WORLD))
     trunk = Trunk(config, config.layers, conditioned=True)
     state = {f"norm.{n}": p for n, p in denoiser.final_norm.state_dict().items()} if not trunk.joint else {}
     trunk.load_state_dict({**{f"layers.{n}": p for n, p in denoiser.layers.state_dict().items()}, **state})
@@ -118,10 +125,10 @@ def test_tokens_are_shape_embedding_plus_positional_encoding() -> None:
 
 def test_what_only_a_denoiser_has_is_refused() -> None:
     with pytest.raises(StackgenError, match="self_conditioning"):
-        PoseRegression(replace(CROSS, self_conditioning=True), RASTER)
+        PoseRegression(replace(CROSS, self_conditioning=True), RASTER, PAPER_WORLD)
     for layers in (0, 3):
         with pytest.raises(StackgenError, match="encoder_layers"):
-            PoseVAE(CROSS, RASTER, replace(VAE, encoder_layers=layers))
+            PoseVAE(CROSS, RASTER, replace(VAE, encoder_layers=layers), PAPER_WORLD)
 
 
 # Whose target is whose.
@@ -286,7 +293,7 @@ def test_the_weight_of_the_divergence_rises_to_its_value() -> None:
 @pytest.mark.parametrize("make", [regression, vae])
 @pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
 def test_samplers_keep_to_the_block_list_and_the_seed(config: DenoiserConfig, make: Any) -> None:
-    sampler = TransformerSampler(make(config), batch=4)
+    sampler = TransformerSampler(make(config), PAPER_WORLD, batch=4)
     pictures = batch_of()["silhouette"][:3].numpy() > 0.5
     counts = np.array([[2, 1, 0, 1], [0, 3, 1, 0], [10, 0, 0, 0]])
     first, again = (sampler.sample_batch(pictures, counts, 2, seed=3) for _ in range(2))
@@ -307,7 +314,7 @@ def test_samplers_keep_to_the_block_list_and_the_seed(config: DenoiserConfig, ma
     ],
 )
 def test_what_cannot_be_sampled_is_one_line(shape: Any, counts: Any, samples: int, message: str) -> None:
-    sampler = TransformerSampler(regression())
+    sampler = TransformerSampler(regression(), PAPER_WORLD)
     with pytest.raises(StackgenError, match=message):
         sampler.sample_batch(np.zeros(shape, bool), np.array(counts), samples, 0)
 

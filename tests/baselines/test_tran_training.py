@@ -11,21 +11,23 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from stackgen.baselines.tran_reg_module import TranReg
+from stackgen.baselines.tran_vae_module import TranVAE
+from stackgen.data.loading.arrays import StackArrays
 
 from stackgen._lightning import pl
 from stackgen.baselines.tran_reg import PoseRegression
-from stackgen.baselines.tran_reg_module import TranReg
 from stackgen.baselines.tran_vae import PoseVAE, VAEConfig
-from stackgen.baselines.tran_vae_module import TranVAE
 from stackgen.baselines.transformer import RegressionConfig
 from stackgen.data.datamodule import StackDataModule
-from stackgen.data.loading.arrays import StackArrays
 from stackgen.errors import StackgenError
 from stackgen.models.diffusion.denoiser import Denoiser, DenoiserConfig
 from stackgen.models.optimization import OptimizerConfig
-from stackgen.models.weights import export_checkpoint, last_checkpoint, load_predictor, load_sampler
+from stackgen.models.weights import export_checkpoint, last_checkpoint
 from stackgen.protocols import StackSampler
+from stackgen.sampling.methods import load_predictor, load_sampler
 from stackgen.training.callbacks import EMA
+from stackgen.world import PAPER_WORLD
 from tests.conftest import Cli, TinyWeights
 from tests.models.conftest import TINY, TINY_CROSS, trainer_for
 
@@ -246,13 +248,13 @@ def test_the_small_paper_recipe_is_the_paper_s_but_for_its_size() -> None:
 
 def test_the_small_networks_are_about_as_large() -> None:
     ours = settings("model", "ddpm-small")["model"]["init_args"]["denoiser"]
-    size = sum(p.numel() for p in Denoiser(DenoiserConfig(**ours)).parameters())
+    size = sum(p.numel() for p in Denoiser(DenoiserConfig(**ours), PAPER_WORLD).parameters())
     for method in METHODS:
         given = settings("baselines", method)["model"]["init_args"]
         transformer, regression = DenoiserConfig(**given["transformer"]), RegressionConfig(**given["regression"])
         network = (
-            PoseRegression(transformer, regression)
+            PoseRegression(transformer, regression, PAPER_WORLD)
             if method == "tran-reg"
-            else PoseVAE(transformer, regression, VAEConfig(**given["vae"]))
+            else PoseVAE(transformer, regression, VAEConfig(**given["vae"]), PAPER_WORLD)
         )
         assert sum(p.numel() for p in network.parameters()) == pytest.approx(size, rel=0.1)

@@ -15,14 +15,8 @@ from safetensors.torch import load_file, save_file
 
 from stackgen.errors import StackgenError
 from stackgen.models import weights as module
-from stackgen.models.weights import (
-    export_checkpoint,
-    load_predictor,
-    load_sampler,
-    read_weights,
-    resolve,
-    write_weights,
-)
+from stackgen.models.weights import export_checkpoint, read_weights, resolve, write_weights
+from stackgen.sampling.methods import load_predictor, load_sampler
 from stackgen.world import PAPER_CATALOGUE
 from tests.conftest import TinyWeights
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from stackgen.errors import StackgenError
-from stackgen.world import Catalogue, Grid
+from stackgen.world import World
 
 MOST_CLASSES = 100_000
 """Block lists that may still have a class each."""
@@ -111,10 +111,10 @@ class ChainHead(nn.Module):
         nn.init.zeros_(self.special.bias)
 
     @staticmethod
-    def of_world(features: int, catalogue: Catalogue, grid: Grid, max_blocks: int) -> ChainHead:
+    def of_world(features: int, world: World) -> ChainHead:
         """The head of a world, areas in steps of half a cell."""
-        sizes = [max(1, round(2 * shape.area)) for shape in catalogue]
-        return ChainHead(features, sizes, max_blocks, 2 * grid.width * grid.height)
+        sizes = [max(1, round(2 * shape.area)) for shape in world.catalogue]
+        return ChainHead(features, sizes, world.max_blocks, 2 * world.grid.width * world.grid.height)
 
     def log_probabilities(self, features: Tensor, counts: Tensor) -> Tensor:
         """Log-probability (B, M) of block lists (B, M, S).

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
 
 from torch import Tensor
 
-from stackgen._lightning import pl
 from stackgen.models.block_list.network import BlockListNetwork, CNNConfig, CNNPredictor
-from stackgen.models.module import WorldMixin
-from stackgen.models.optimization import OptimizerConfig, configure_optimizer
+from stackgen.models.module import StackgenModule
+from stackgen.models.optimization import OptimizerConfig
+from stackgen.world import World
 
 
-class BlockListCNN(WorldMixin, pl.LightningModule):
+class BlockListCNN(StackgenModule):
     """Predicts the block list from the silhouette: the true list's log-probability grows (paper, Eq. 5).
 
     Args:
@@ -28,16 +27,13 @@ class BlockListCNN(WorldMixin, pl.LightningModule):
         cnn: CNNConfig = CNNConfig(),  # noqa: B008 - frozen
         optimizer: OptimizerConfig = OptimizerConfig(),  # noqa: B008
     ) -> None:
-        super().__init__()
-        self.config: dict[str, Any] = {"cnn": asdict(cnn)}
-        self.optimizer_config = optimizer
+        super().__init__({"cnn": asdict(cnn)}, optimizer)
         self._cnn = cnn
         self.model: BlockListNetwork
 
-    def build(self) -> None:
-        """Make the network once its world is known."""
-        if not hasattr(self, "model"):
-            self.model = BlockListNetwork(self._cnn, self.catalogue, self.max_blocks, self.grid)
+    def make(self, world: World) -> BlockListNetwork:
+        """See StackgenModule."""
+        return BlockListNetwork(self._cnn, world)
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """One step of the cross-entropy."""
@@ -63,13 +59,9 @@ class BlockListCNN(WorldMixin, pl.LightningModule):
         """Whether each of the three best lists is the true one (B, 3)."""
         return (self.model.out.best(features, 3) == truth[:, None]).all(-1)
 
-    def configure_optimizers(self) -> Any:
-        """AdamW and its learning-rate course."""
-        return configure_optimizer(self, self.optimizer_config)
-
     def predictor(self) -> CNNPredictor:
         """The network as a BlockListPredictor, sharing its weights."""
         was_training = self.model.training
-        predictor = CNNPredictor(self.model, self.catalogue, self.grid, self.max_blocks)
+        predictor = CNNPredictor(self.model, self.world)
         self.model.train(was_training)
         return predictor

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 
 from stackgen.errors import StackgenError
 from stackgen.models.block_list.heads import MOST_CLASSES, ChainHead, ClassHead, number_of_lists
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
+from stackgen.world import Mask, World
 
 
 @dataclass(frozen=True)
@@ -44,16 +44,13 @@ class BlockListNetwork(nn.Module):
 
     Args:
         config: See CNNConfig.
-        catalogue, max_blocks: Which lists there are.
-        grid: Bounds the area that a list can fill.
+        world: Says which block lists there are, and the area that one can fill.
     """
 
     def __init__(
         self,
         config: CNNConfig,
-        catalogue: Catalogue = PAPER_CATALOGUE,
-        max_blocks: int = MAX_BLOCKS,
-        grid: Grid = PAPER_GRID,
+        world: World,
     ) -> None:
         super().__init__()
         stride = config.stem_stride
@@ -61,12 +58,12 @@ class BlockListNetwork(nn.Module):
         self.layers = nn.Sequential(*(Residual(config.channels) for _ in range(config.layers)))
         self.pool = nn.AdaptiveMaxPool2d(config.pool)
         self.hidden = nn.Linear(config.channels * config.pool**2, config.hidden)
-        few = number_of_lists(len(catalogue), max_blocks) <= MOST_CLASSES
+        few = number_of_lists(len(world.catalogue), world.max_blocks) <= MOST_CLASSES
         self.out: ClassHead | ChainHead
         if config.head == "classes" or (config.head == "auto" and few):
-            self.out = ClassHead(config.hidden, len(catalogue), max_blocks)
+            self.out = ClassHead(config.hidden, len(world.catalogue), world.max_blocks)
         else:
-            self.out = ChainHead.of_world(config.hidden, catalogue, grid, max_blocks)
+            self.out = ChainHead.of_world(config.hidden, world)
 
     def features(self, silhouettes: Tensor) -> Tensor:
         """(B, H, W) silhouettes to what the head reads (B, hidden)."""
@@ -100,22 +97,20 @@ class CNNPredictor:
     """A BlockListPredictor: the network with its world.
 
     Args:
-        network: Trained.
-        catalogue, grid, max_blocks: The world it was trained in.
+        network: The trained network.
+        world: The world it was trained in.
         card: What is known about the weights.
     """
 
     def __init__(
         self,
         network: BlockListNetwork,
-        catalogue: Catalogue = PAPER_CATALOGUE,
-        grid: Grid = PAPER_GRID,
-        max_blocks: int = MAX_BLOCKS,
+        world: World,
         card: dict[str, Any] | None = None,
     ) -> None:
         self.network = network.eval()
-        self.catalogue, self.grid, self.max_blocks = catalogue, grid, max_blocks
-        self.card = card or {}
+        self.world = world
+        self.card: dict[str, Any] = card or {}
 
     @torch.inference_mode()
     def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
@@ -145,7 +140,7 @@ class CNNPredictor:
     def _lists(self, counts: ArrayLike, dimensions: int) -> Tensor:
         """Counts (..., S) where the network is."""
         array = np.asarray(counts, dtype=np.int64)
-        if array.ndim != dimensions or array.shape[-1] != len(self.catalogue):
-            names = ", ".join(self.catalogue.names)
+        if array.ndim != dimensions or array.shape[-1] != len(self.world.catalogue):
+            names = ", ".join(self.world.catalogue.names)
             raise StackgenError(f"block list: one count for each of {names}, got an array {array.shape}")
         return torch.from_numpy(array).to(self.network.hidden.weight.device)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from stackgen.errors import StackgenError
-from stackgen.world import MAX_BLOCKS
+from stackgen.world import World
 
 POSE = 6
 _ROW_STEP = 0.25  # [cell] blocks of one shape whose centres differ by more lie in different rows
@@ -70,26 +70,22 @@ class Denoiser(nn.Module):
 
     Args:
         config: See DenoiserConfig.
-        num_shapes: Size of the shape codebook.
-        image_size: Edge of the silhouette [pixel].
-        max_blocks: N.
+        world: Size of the shape codebook, edge of the silhouette [pixel], and N.
     """
 
-    def __init__(
-        self, config: DenoiserConfig, num_shapes: int = 4, image_size: int = 64, max_blocks: int = MAX_BLOCKS
-    ) -> None:
+    def __init__(self, config: DenoiserConfig, world: World) -> None:
         super().__init__()
         self.config = config
         d = config.width
         self.pose_embedding = mlp(POSE, d, d)
-        self.shape_embedding = nn.Embedding(num_shapes, d)
+        self.shape_embedding = nn.Embedding(len(world.catalogue), d)
         if config.ordered:
-            self.rank_embedding = nn.Embedding(max_blocks, d)
+            self.rank_embedding = nn.Embedding(world.max_blocks, d)
         if config.self_conditioning:
             self.estimate_embedding = nn.Linear(POSE, d, bias=False)
             nn.init.zeros_(self.estimate_embedding.weight)
         self.time_embedding = mlp(d, d, d)
-        self.patches = Patches(config.patch, config.stride, image_size, d)
+        self.patches = Patches(config.patch, config.stride, world.grid.image_size, d)
         if config.conditioning == "joint":
             self.memory_encoder = nn.ModuleList()
             self.layers = nn.ModuleList(EncoderLayer(config) for _ in range(config.layers))

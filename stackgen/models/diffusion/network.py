@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -13,12 +12,12 @@ from torch import Tensor, nn
 
 from stackgen.errors import StackgenError
 from stackgen.models.diffusion.denoiser import POSE, Denoiser, DenoiserConfig, raster_order
-from stackgen.models.diffusion.samplers import Callback, Predict, ancestral, multistep
+from stackgen.models.diffusion.samplers import Predict, ancestral, multistep
 from stackgen.models.diffusion.schedules import Schedule, ScheduleConfig
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.models.network_sampler import NetworkSampler
 from stackgen.stack import Stack
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
+from stackgen.world import Mask, World
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,7 @@ class PoseDiffusion(nn.Module):
 
     Args:
         denoiser, schedule, diffusion: Their descriptions.
-        num_shapes: Size of the catalogue.
-        image_size: Edge of the silhouette [pixel].
-        max_blocks: N.
+        world: Shapes, size of the silhouette, and N.
     """
 
     mean: Tensor
@@ -73,14 +70,12 @@ class PoseDiffusion(nn.Module):
         denoiser: DenoiserConfig,
         schedule: ScheduleConfig,
         diffusion: DiffusionConfig,
-        num_shapes: int = 4,
-        image_size: int = 64,
-        max_blocks: int = MAX_BLOCKS,
+        world: World,
     ) -> None:
         super().__init__()
         self.config = diffusion
         self.schedule = Schedule(schedule)
-        self.denoiser = Denoiser(denoiser, num_shapes, image_size, max_blocks)
+        self.denoiser = Denoiser(denoiser, world)
         self.register_buffer("mean", torch.zeros(POSE))
         self.register_buffer("std", torch.ones(POSE))
 
@@ -168,35 +163,28 @@ class PoseDiffusion(nn.Module):
         shapes: Tensor,
         mask: Tensor,
         generator: torch.Generator,
-        callback: Callback | None = None,
         sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
-        guide: PoseDiffusion | None = None,
     ) -> Tensor:
         """Poses (B, N, 6) [cell, rad] for silhouettes (B / n, H, W), each serving n rows of shapes (B, N).
 
         Args:
             silhouettes, shapes, mask: As the denoiser takes them.
             generator: Of all noise.
-            callback: Told (t, poses [cell, rad]) before each step and (0, poses) at the end.
             sampler: The way from noise to poses.
-            guide: The other version of this model that `sampler` asks for.
         """
         config = self.complete(sampler)
         predict = self._predictor(silhouettes, shapes, mask)
-        if guide is not None:
-            predict = self._guided(predict, guide._predictor(silhouettes, shapes, mask), config)
-        elif config.guidance is not None and config.guidance != 1:
+        if config.guidance is not None and config.guidance != 1:
             predict = self._guided(predict, self._predictor(torch.zeros_like(silhouettes), shapes, mask), config)
-        shown = None if callback is None else (lambda t, x: callback(t, x * self.std + self.mean))
         noise = torch.randn((*shapes.shape, POSE), generator=generator, device=generator.device).to(shapes.device)
         assert config.steps and config.spacing
         steps = self.schedule.subset(config.steps, config.spacing)
         if config.kind == "ddpm":
             posterior = config.variance == "posterior"
-            x = ancestral(predict, noise, self.schedule, generator, steps, posterior, shown)
+            x = ancestral(predict, noise, self.schedule, generator, steps, posterior)
         else:
             order, eta = 2 if config.kind == "dpm" else 1, config.eta or 0.0
-            x = multistep(predict, noise, self.schedule, generator, steps, order, eta, shown)
+            x = multistep(predict, noise, self.schedule, generator, steps, order, eta)
         return x * self.std + self.mean
 
     def complete(self, sampler: SamplerConfig) -> SamplerConfig:
@@ -225,8 +213,8 @@ class PoseDiffusion(nn.Module):
         """See DenoiserConfig."""
         return self.denoiser.config.trims
 
-    def _guided(self, own: Predict, other: Predict, config: SamplerConfig) -> Predict:
-        """Away from what another predictor would do, a weaker model or this one blind, or towards it."""
+    def _guided(self, own: Predict, blind: Predict, config: SamplerConfig) -> Predict:
+        """Away from what the model would do without the silhouette (classifier-free guidance, Ho & Salimans 2022)."""
         assert config.guided is not None and config.guidance is not None
         first, last = (share * self.schedule.steps for share in config.guided)
         weight = config.guidance
@@ -234,81 +222,56 @@ class PoseDiffusion(nn.Module):
         def predict(x: Tensor, t: Tensor) -> Tensor:
             if not first <= int(t) <= last:
                 return own(x, t)
-            theirs = other(x, t)
+            theirs = blind(x, t)
             return self._bounded(theirs + weight * (own(x, t) - theirs)) if weight else theirs
 
         return predict
-
-    def guided_by(self, other: PoseDiffusion) -> bool:
-        """Whether another model's estimates mean the same as this one's: same schedule, same normalisation."""
-        same = torch.allclose(self.mean, other.mean, atol=1e-3) and torch.allclose(self.std, other.std, rtol=1e-3)
-        return same and self.schedule.config == other.schedule.config
 
 
 class DiffusionSampler(NetworkSampler[PoseDiffusion]):
     """A StackSampler: the diffusion model with its world.
 
     Args:
-        model: Trained.
-        catalogue, grid, max_blocks: The world it was trained in.
+        model: The trained network.
+        world: The world it was trained in.
         card: What is known about the weights.
-        batch: Stacks denoised together, at most.
+        batch: How many stacks are denoised together, at most.
         sampler: The way from noise to poses; what is null is as the card has it, else the model.
 
     Raises:
-        StackgenError: If the settings do not fit the model, or there is no such guide.
+        StackgenError: If the settings do not fit the model.
     """
 
     def __init__(
         self,
         model: PoseDiffusion,
-        catalogue: Catalogue = PAPER_CATALOGUE,
-        grid: Grid = PAPER_GRID,
-        max_blocks: int = MAX_BLOCKS,
+        world: World,
         card: dict[str, Any] | None = None,
         batch: int = 512,
         sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
     ) -> None:
-        super().__init__(model, catalogue, grid, max_blocks, card, batch)
+        super().__init__(model, world, card, batch)
         self.sampler = self.model.complete(sampler.over(SamplerConfig.of_card(self.card)))
-        self.guide = None if self.sampler.guide is None else self._guide(self.sampler.guide)
 
     def configured(self, sampler: SamplerConfig) -> DiffusionSampler:
         """The same model with other settings, where they are not null."""
-        world = self.catalogue, self.grid, self.max_blocks
-        return DiffusionSampler(self.model, *world, self.card, self.batch, sampler)
+        return DiffusionSampler(self.model, self.world, self.card, self.batch, sampler)
 
     @property
     def settings(self) -> dict[str, Any]:
         """How it samples, for the record."""
         return self.sampler.given()
 
-    def _guide(self, weights: str) -> PoseDiffusion:
-        from stackgen.models.weights import load_sampler  # which imports this module
-
-        other = load_sampler(weights)
-        if not isinstance(other, DiffusionSampler) or not self.model.guided_by(other.model):
-            raise StackgenError(
-                f"sampler.guide: {weights} is no diffusion model of the same noise schedule and normalisation"
-            )
-        return other.model
-
     def sample_batch(
-        self,
-        silhouettes: Mask,
-        counts: NDArray[np.int64],
-        num_samples: int,
-        seed: int,
-        callback: Callable[[int, NDArray[np.float64]], None] | None = None,
+        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
     ) -> list[list[Stack]]:
-        """See StackSampler; `callback` gets (t, poses (B * num_samples, N, 6)) as the noise goes away.
+        """See StackSampler.
 
         Raises:
             StackgenError: If a block list is empty or longer than the model takes, or sizes differ.
         """
-        shown = None if callback is None else (lambda t, x: callback(t, x.double().cpu().numpy()))
 
         def draw(pictures: Tensor, shapes: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
-            return self.model.sample(pictures, shapes, mask, generator, shown, self.sampler, self.guide)
+            return self.model.sample(pictures, shapes, mask, generator, self.sampler)
 
         return self._answer(silhouettes, counts, num_samples, seed, draw)

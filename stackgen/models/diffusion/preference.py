@@ -84,7 +84,7 @@ class VerdictTuning(DDPM):
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """The data's loss and the pairs'."""
         data = super().training_step(batch, index)
-        generator = self._noise_of_step(_OTHER + index, self.device)
+        generator = self.generator_of_step(_OTHER + index, self.device)
         loss, right = self._preference_loss(generator)
         self.log("train/preference_loss", loss, prog_bar=True)
         self.log("train/preferred", right)

@@ -27,12 +27,9 @@ class SamplerConfig:
             `spacing` of even ones.
         eta: Share of fresh noise in each step of `ddim` and `dpm`: 0 for none, 1 for as much as `ddpm` has.
         variance: Of the noise of `ddpm`: `beta` (paper) or `posterior`, see samplers.ancestral.
-        guide: Weights of a weaker version of the model, for autoguidance (Karras et al. 2024): the estimate is
-            weak + guidance (strong - weak).
-        guidance: Its weight; 1 is none, 0 leaves the weaker model alone to act there. Without a guide a model that
-            was trained with `drop_silhouette` takes that part itself, without the silhouette (classifier-free
-            guidance, Ho & Salimans 2022).
-        guided: Where it acts, as shares of T: from which to which t.
+        guidance: Weight of classifier-free guidance (Ho & Salimans 2022), for a model that was trained with
+            `drop_silhouette`: 1 is none, 0 leaves the silhouette out.
+        guided: Where guidance acts, as shares of T: from which to which t.
 
     Raises:
         StackgenError: If a number is out of its range.
@@ -43,7 +40,6 @@ class SamplerConfig:
     spacing: float | None = None
     eta: float | None = None
     variance: Literal["beta", "posterior"] | None = None
-    guide: str | None = None
     guidance: float | None = None
     guided: tuple[float, float] | None = None
 
@@ -86,12 +82,9 @@ class SamplerConfig:
                 raise StackgenError(f"sampler.{name} is not for {kind}; set {_OF_KIND[kind]}, or another kind")
         if self.steps is not None and self.steps > steps:
             raise StackgenError(f"sampler.steps: this model has {steps} steps, not {self.steps}")
-        if self.guide is not None:
-            guidance = 1.5
-        elif guidance is None and (self.guidance is not None or self.guided is not None):
+        if guidance is None and (self.guidance is not None or self.guided is not None):
             raise StackgenError(
-                "sampler.guidance and sampler.guided need sampler.guide, weights of a weaker model,"
-                " or a model trained with diffusion.drop_silhouette"
+                "sampler.guidance and sampler.guided need a model trained with diffusion.drop_silhouette"
             )
         defaults = SamplerConfig(kind, steps, SPACING, **({"variance": variance} if kind == "ddpm" else {"eta": 0.0}))
         if guidance is not None:

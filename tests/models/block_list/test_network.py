@@ -9,18 +9,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from stackgen.data.loading.arrays import StackArrays
 from torch import Tensor, nn
 
 from stackgen._lightning import pl
 from stackgen.data.datamodule import StackDataModule
-from stackgen.data.loading.arrays import StackArrays
 from stackgen.errors import StackgenError
 from stackgen.models.block_list.heads import ChainHead, ClassHead, all_block_lists, number_of_lists
 from stackgen.models.block_list.module import BlockListCNN
 from stackgen.models.block_list.network import BlockListNetwork, CNNConfig, CNNPredictor, Residual
 from stackgen.models.optimization import OptimizerConfig
-from stackgen.models.weights import export_checkpoint, load_predictor
-from stackgen.world import Catalogue, Grid, Shape
+from stackgen.models.weights import export_checkpoint
+from stackgen.sampling.methods import load_predictor
+from stackgen.world import PAPER_WORLD, Catalogue, Grid, Shape
 from tests.models.conftest import trainer_for
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -40,7 +41,7 @@ def test_there_is_a_class_for_every_multiset_in_lexicographic_order(shapes: int,
 
 
 def test_the_paper_s_world_has_a_thousand_classes() -> None:
-    head = BlockListNetwork(CNNConfig(layers=1)).out
+    head = BlockListNetwork(CNNConfig(layers=1), PAPER_WORLD).out
     assert isinstance(head, ClassHead) and head.out_features == math.comb(14, 4) - 1 == 1000
 
 
@@ -135,7 +136,7 @@ def test_the_chain_s_best_list_of_a_large_world_beats_all_others_tried() -> None
 
 def test_the_paper_s_network() -> None:
     """Ten channels at full size through thirty residual layers, max pooling, two fully connected layers."""
-    network = BlockListNetwork(CNNConfig())
+    network = BlockListNetwork(CNNConfig(), PAPER_WORLD)
     layers = [layer for layer in network.layers if isinstance(layer, Residual)]
     assert len(layers) == 30 and network.stem.out_channels == 10
     shapes: list[torch.Size] = []
@@ -163,7 +164,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> BlockListNetwork:
     def features(silhouettes: Tensor) -> Tensor:
         return -(torch.arange(1000) - silhouettes.sum((1, 2)).long()[:, None]).abs().float()
 
-    network = BlockListNetwork(SMALL)
+    network = BlockListNetwork(SMALL, PAPER_WORLD)
     network.out = ClassHead(1000, 4, 10)
     nn.init.eye_(network.out.weight)
     nn.init.zeros_(network.out.bias)
@@ -172,7 +173,7 @@ def known(monkeypatch: pytest.MonkeyPatch) -> BlockListNetwork:
 
 
 def test_predictions_are_the_lists_of_the_best_classes(known: BlockListNetwork) -> None:
-    predictor = CNNPredictor(known)
+    predictor = CNNPredictor(known, PAPER_WORLD)
     wanted = np.array([3, 500, 998] * 200)  # more than one batch
     pictures = np.zeros((600, 4096), bool)
     for picture, count in zip(pictures, wanted, strict=True):
@@ -193,7 +194,7 @@ def test_predictions_are_the_lists_of_the_best_classes(known: BlockListNetwork) 
 @pytest.mark.parametrize("limit", [np.array([1, 1]), np.array([[1, 1, 1, 1]])])
 def test_an_inventory_of_another_catalogue_is_an_error(limit: np.ndarray) -> None:
     with pytest.raises(StackgenError, match="one count for each of cube, rectangle"):
-        CNNPredictor(BlockListNetwork(SMALL)).predict(np.ones((1, 64, 64), bool), limit=limit)
+        CNNPredictor(BlockListNetwork(SMALL, PAPER_WORLD)).predict(np.ones((1, 64, 64), bool), limit=limit)
 
 
 # A fit.

@@ -22,6 +22,7 @@ from stackgen.models.diffusion.denoiser import (
     sinusoids,
     split_heads,
 )
+from stackgen.world import PAPER_WORLD
 
 PAPER = DenoiserConfig(width=32, layers=2, heads=4, feedforward=48)
 MASKED = replace(PAPER, mask_padding=True)
@@ -33,7 +34,7 @@ BATCH, BLOCKS = 4, 7
 def made(config: DenoiserConfig) -> Denoiser:
     """With every weight drawn, also those that begin at zero."""
     torch.manual_seed(0)
-    model = Denoiser(config).eval()
+    model = Denoiser(config, PAPER_WORLD).eval()
     with torch.no_grad():
         for weight in model.parameters():
             weight.normal_(0, 0.2)
@@ -69,7 +70,7 @@ def close(a: Tensor, b: Tensor) -> bool:
 
 
 def test_the_paper_s_model_has_the_paper_s_size() -> None:
-    model = Denoiser(DenoiserConfig())
+    model = Denoiser(DenoiserConfig(), PAPER_WORLD)
     config, d = model.config, 512
     assert (config.width, config.layers, config.heads, config.feedforward) == (512, 6, 8, 2048)
     assert (config.conditioning, config.mask_padding, config.ordered) == ("joint", False, False)
@@ -250,7 +251,7 @@ def test_every_input_matters(config: DenoiserConfig) -> None:
 
 
 def test_an_untrained_cross_model_begins_with_zero() -> None:
-    assert (run(Denoiser(CROSS), scene()) == 0).all()
+    assert (run(Denoiser(CROSS, PAPER_WORLD), scene()) == 0).all()
 
 
 # The order of blocks.

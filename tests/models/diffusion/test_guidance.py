@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import pytest
 import torch
+from stackgen.data.loading.arrays import StackArrays
 from torch import Tensor
 
-from stackgen.data.loading.arrays import StackArrays
 from stackgen.errors import StackgenError
 from stackgen.models.diffusion.denoiser import Denoiser
 from stackgen.models.diffusion.network import DiffusionConfig, DiffusionSampler, PoseDiffusion
 from stackgen.models.diffusion.schedules import ScheduleConfig
 from stackgen.models.diffusion.settings import SamplerConfig
+from stackgen.world import PAPER_WORLD
 from tests.models.conftest import TINY
 
 STEPS = 10
@@ -45,7 +46,7 @@ def batch(arrays: StackArrays) -> dict[str, Tensor]:
 def model_with(drop_silhouette: float, guidance: float = 1.0) -> PoseDiffusion:
     torch.manual_seed(0)
     diffusion = DiffusionConfig(drop_silhouette=drop_silhouette, guidance=guidance)
-    return PoseDiffusion(TINY, ScheduleConfig(steps=STEPS), diffusion)
+    return PoseDiffusion(TINY, ScheduleConfig(steps=STEPS), diffusion, PAPER_WORLD)
 
 
 @pytest.mark.parametrize("weight", [0.0, 1.0, 1.5, 3.0])
@@ -61,15 +62,15 @@ def test_the_estimate_moves_away_from_what_it_is_without_the_silhouette(
 
 
 def test_the_weight_is_the_models_unless_another_is_asked_for() -> None:
-    sampler = DiffusionSampler(model_with(0.1, guidance=2.0))
+    sampler = DiffusionSampler(model_with(0.1, guidance=2.0), PAPER_WORLD)
     assert sampler.settings["guidance"] == 2.0
     assert sampler.configured(SamplerConfig(guidance=1.0)).settings["guidance"] == 1.0
-    assert "guidance" not in DiffusionSampler(model_with(0.0)).settings
+    assert "guidance" not in DiffusionSampler(model_with(0.0), PAPER_WORLD).settings
 
 
 def test_only_what_was_trained_without_silhouettes_guides_itself() -> None:
     with pytest.raises(StackgenError, match="drop_silhouette"):
-        DiffusionSampler(model_with(0.0), sampler=SamplerConfig(guidance=2.0))
+        DiffusionSampler(model_with(0.0), PAPER_WORLD, sampler=SamplerConfig(guidance=2.0))
     with pytest.raises(StackgenError, match="guidance needs"):
         DiffusionConfig(guidance=2.0)
     with pytest.raises(StackgenError, match=r"must lie in \[0, 1\)"):

@@ -23,8 +23,9 @@ from stackgen.models.diffusion.module import DDPM
 from stackgen.models.diffusion.network import DiffusionConfig
 from stackgen.models.diffusion.schedules import ScheduleConfig
 from stackgen.models.optimization import OptimizerConfig
-from stackgen.models.weights import export_checkpoint, load_sampler
+from stackgen.models.weights import export_checkpoint
 from stackgen.protocols import StackSampler
+from stackgen.sampling.methods import load_sampler
 from stackgen.training.callbacks import EMA, RAW_WEIGHTS
 from tests.conftest import CHILD
 from tests.models.conftest import TINY, TINY_CROSS, trainer_for
@@ -173,7 +174,7 @@ def test_the_noise_of_a_step_is_its_own(compact: Path, tmp_path: Path) -> None:
     trainer_for(tmp_path, max_steps=1).fit(module, data_of(compact))
 
     def noise(index: int) -> float:
-        return float(torch.rand(1, generator=module._noise_of_step(index, torch.device("cpu"))))
+        return float(torch.rand(1, generator=module.generator_of_step(index, torch.device("cpu"))))
 
     assert noise(3) == noise(3) != noise(4)
     first = noise(3)

@@ -8,15 +8,16 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 import torch
+from stackgen.data.loading.arrays import StackArrays
 from torch import Tensor
 
-from stackgen.data.loading.arrays import StackArrays
 from stackgen.errors import StackgenError
 from stackgen.models.diffusion.denoiser import DenoiserConfig
 from stackgen.models.diffusion.network import DiffusionConfig, DiffusionSampler, PoseDiffusion
 from stackgen.models.diffusion.schedules import ScheduleConfig
 from stackgen.models.diffusion.settings import SPACING, SamplerConfig
 from stackgen.stack import shapes_of
+from stackgen.world import PAPER_WORLD
 from tests.models.conftest import TINY, TINY_CROSS
 
 MEAN, STD = np.array([0.1, 0, 1.9, 0, 0, 0]), np.array([1.1, 0.01, 1.2, 0.02, 0.03, 0.04])
@@ -57,7 +58,7 @@ def model_for(
     prediction: Prediction = "epsilon", denoiser: DenoiserConfig = TINY, clip: float | None = None
 ) -> PoseDiffusion:
     torch.manual_seed(0)
-    model = PoseDiffusion(denoiser, ScheduleConfig(), DiffusionConfig(prediction, clip))
+    model = PoseDiffusion(denoiser, ScheduleConfig(), DiffusionConfig(prediction, clip), PAPER_WORLD)
     with torch.no_grad():
         for weight in model.parameters():
             weight.normal_(0, 0.1)
@@ -160,10 +161,10 @@ def test_draws_of_one_sample_share_its_picture_and_nothing_else(batch: dict[str,
 
 
 def test_constant_dimensions_are_not_divided_by_nothing() -> None:
-    model = PoseDiffusion(TINY, ScheduleConfig(), DiffusionConfig())
+    model = PoseDiffusion(TINY, ScheduleConfig(), DiffusionConfig(), PAPER_WORLD)
     model.fit_normalization(np.zeros(6), np.zeros(6))
     assert (model.std > 0).all()
-    bounded = PoseDiffusion(TINY, ScheduleConfig(), DiffusionConfig(least_std=0.05))
+    bounded = PoseDiffusion(TINY, ScheduleConfig(), DiffusionConfig(least_std=0.05), PAPER_WORLD)
     bounded.fit_normalization(MEAN, STD)
     assert bounded.std == pytest.approx(torch.tensor([1.1, 0.05, 1.2, 0.05, 0.05, 0.05]))
     assert bounded.mean == pytest.approx(torch.as_tensor(MEAN, dtype=torch.float32))
@@ -187,7 +188,7 @@ def test_a_perfect_predictor_samples_the_truth(
 
 @pytest.mark.parametrize("denoiser", [TINY, TINY_CROSS], ids=["paper", "cross"])
 def test_samples_depend_on_the_seed_and_on_nothing_else(denoiser: DenoiserConfig, arrays: StackArrays) -> None:
-    sampler = DiffusionSampler(model_for(denoiser=denoiser))
+    sampler = DiffusionSampler(model_for(denoiser=denoiser), PAPER_WORLD)
     pictures, counts = arrays.images(range(5)), arrays.counts[:5]
 
     def poses(seed: int) -> np.ndarray:
@@ -228,7 +229,7 @@ def test_scenes_do_not_mix(batch_size: int, arrays: StackArrays) -> None:
     clean = torch.stack([torch.nn.functional.pad((t - model.mean) / model.std, (0, 0, 0, 10 - len(t))) for t in truth])
     oracles = Oracles([Oracle(model, clean[i : i + together]) for i in range(0, 4, together)])
     model.denoiser = oracles  # type: ignore[assignment]
-    sampler = DiffusionSampler(model, batch=batch_size)
+    sampler = DiffusionSampler(model, PAPER_WORLD, batch=batch_size)
     scenes = sampler.sample_batch(arrays.images(range(4)), arrays.counts[:4], 3, 0)
     assert oracles.turn == len(oracles.oracles) - 1
     for scene, expected in zip(scenes, truth, strict=True):
@@ -237,7 +238,7 @@ def test_scenes_do_not_mix(batch_size: int, arrays: StackArrays) -> None:
 
 
 def test_the_way_from_noise_is_shown_in_cells(arrays: StackArrays) -> None:
-    sampler, seen = DiffusionSampler(model_for()), {}
+    sampler, seen = DiffusionSampler(model_for(), PAPER_WORLD), {}
     scenes = sampler.sample_batch(
         arrays.images([0]), arrays.counts[:1], 2, 0, callback=lambda t, poses: seen.update({t: poses})
     )
@@ -283,7 +284,7 @@ def test_a_perfect_predictor_samples_the_truth_in_every_way(
 
 
 def test_settings_change_the_samples_and_their_absence_nothing(arrays: StackArrays) -> None:
-    sampler = DiffusionSampler(model_for("v", TINY_CROSS))
+    sampler = DiffusionSampler(model_for("v", TINY_CROSS), PAPER_WORLD)
     scene = arrays.images([0]), arrays.counts[:1], 2, 0
 
     def poses(settings: SamplerConfig) -> np.ndarray:
@@ -296,12 +297,12 @@ def test_settings_change_the_samples_and_their_absence_nothing(arrays: StackArra
 
 def test_what_the_card_says_of_sampling_holds_unless_overridden() -> None:
     model = model_for()
-    sampler = DiffusionSampler(model, card={"sampler": {"kind": "dpm", "steps": 8, "eta": 0.5}})
+    sampler = DiffusionSampler(model, PAPER_WORLD, card={"sampler": {"kind": "dpm", "steps": 8, "eta": 0.5}})
     assert sampler.sampler == SamplerConfig("dpm", 8, SPACING, eta=0.5)
     assert sampler.configured(SamplerConfig(steps=5)).sampler == SamplerConfig("dpm", 5, SPACING, eta=0.5)
     assert sampler.configured(SamplerConfig("ddpm")).sampler == SamplerConfig("ddpm", 8, SPACING, variance="beta")
     with pytest.raises(StackgenError, match="weights card"):
-        DiffusionSampler(model, card={"sampler": {"colour": "red"}})
+        DiffusionSampler(model, PAPER_WORLD, card={"sampler": {"colour": "red"}})
 
 
 @pytest.mark.parametrize(
@@ -322,7 +323,7 @@ def test_what_the_card_says_of_sampling_holds_unless_overridden() -> None:
 )
 def test_settings_that_cannot_be_are_refused(settings: dict[str, Any], message: str) -> None:
     with pytest.raises(StackgenError, match=message):
-        DiffusionSampler(model_for(), sampler=SamplerConfig(**settings))
+        DiffusionSampler(model_for(), PAPER_WORLD, sampler=SamplerConfig(**settings))
 
 
 # Guidance.
@@ -364,7 +365,7 @@ def test_only_a_model_of_the_same_world_can_guide() -> None:
     assert model.guided_by(other)  # another network, another target: estimates of the clean poses are alike
     other.fit_normalization(MEAN, STD * 2)
     assert not model.guided_by(other)
-    assert not model.guided_by(PoseDiffusion(TINY, ScheduleConfig(steps=20), DiffusionConfig()))
+    assert not model.guided_by(PoseDiffusion(TINY, ScheduleConfig(steps=20), DiffusionConfig(), PAPER_WORLD))
 
 
 def test_the_network_is_shown_its_last_estimate(batch: dict[str, Tensor], monkeypatch: pytest.MonkeyPatch) -> None:

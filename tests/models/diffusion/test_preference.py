@@ -18,8 +18,8 @@ from stackgen.errors import StackgenError
 from stackgen.models.diffusion.network import DiffusionSampler
 from stackgen.models.diffusion.preference import VerdictTuning
 from stackgen.models.optimization import OptimizerConfig
-from stackgen.models.weights import load_sampler
 from stackgen.protocols import Verdict
+from stackgen.sampling.methods import load_sampler
 from stackgen.stack import Stack
 from stackgen.world import Mask
 from tests.conftest import Cli, TinyWeights

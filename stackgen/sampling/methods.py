@@ -1,0 +1,71 @@
+"""Every method by name: heuristics, and the networks behind weights.
+
+torch is imported where weights are read, so that a heuristic is had without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stackgen.baselines import HEURISTICS
+from stackgen.errors import StackgenError
+from stackgen.protocols import BlockListPredictor, StackSampler
+
+if TYPE_CHECKING:
+    from stackgen.models.weights import Maker
+
+
+def load_sampler(weights: str | Path = "default") -> StackSampler:
+    """The sampler behind a name (of a heuristic or of weights), a `.safetensors` or `.ckpt` file, or a run's folder.
+
+    Raises:
+        StackgenError: If there is no such thing, or it holds something else.
+    """
+    if str(weights) in HEURISTICS:
+        return HEURISTICS[str(weights)]()
+    return _load(weights, "sampler", _samplers())
+
+
+def load_predictor(weights: str | Path = "default") -> BlockListPredictor:
+    """The block-list predictor behind a name of weights, a `.safetensors` or `.ckpt` file, or a run's folder.
+
+    Raises:
+        StackgenError: If there is no such thing, or it holds something else.
+    """
+    return _load(weights, "block-list predictor", _predictors())
+
+
+def role_of(weights: str | Path) -> str:
+    """`predictor` where a name, file or checkpoint of ours holds a block-list network, else `sampler`.
+
+    Raises:
+        StackgenError: If there is no such thing or it is damaged.
+    """
+    from stackgen.models.weights import read_weights
+
+    return "predictor" if read_weights(weights)[1].get("kind") in _predictors() else "sampler"
+
+
+def _load(weights: str | Path, what: str, makers: Mapping[str, Maker]) -> Any:
+    from stackgen.models.weights import build, read_weights
+
+    tensors, card = read_weights(weights, *(("sampler", tuple(HEURISTICS)) if what == "sampler" else ("predictor",)))
+    if card.get("kind") not in makers:
+        raise StackgenError(f"{weights} holds weights of kind {card.get('kind')!r}, not of a {what}")
+    return build(weights, card, tensors, makers[card["kind"]])
+
+
+def _samplers() -> dict[str, Maker]:
+    from stackgen.baselines.tran_reg import make_tran_reg
+    from stackgen.baselines.tran_vae import make_tran_vae
+    from stackgen.models.weights import make_diffusion
+
+    return {"ddpm": make_diffusion, "tran-reg": make_tran_reg, "tran-vae": make_tran_vae}
+
+
+def _predictors() -> dict[str, Maker]:
+    from stackgen.models.weights import make_block_list
+
+    return {"blocklist": make_block_list}
