@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from stackgen.stack import Stack
-from stackgen.world import PAPER_GRID, Grid, Mask, View
+from stackgen.world import Grid, Mask, View
 
 Floats = NDArray[np.float64]
 
@@ -59,7 +59,7 @@ def mirror(stack: Stack) -> Stack:
     return stack.with_poses(stack.poses * np.array([-1, 1, 1, 1, -1, -1]) + 0.0)
 
 
-def silhouette(stack: Stack, view: View = "front", grid: Grid = PAPER_GRID, margin: int = 0) -> Mask:
+def silhouette(stack: Stack, grid: Grid, view: View = "front", margin: int = 0) -> Mask:
     """Orthographic silhouette (H, W): a pixel is set when its centre is covered by a block.
 
     Front shows (x, z), side (y, z), top (x, y), the second axis upwards. `margin` adds pixels on all
@@ -100,7 +100,7 @@ def iou(a: Mask, b: Mask) -> float:
     return float(np.count_nonzero(a & b) / union) if union else 1.0
 
 
-def silhouette_iou(stack: Stack, target: Mask, view: View = "front", grid: Grid = PAPER_GRID) -> float:
+def silhouette_iou(stack: Stack, target: Mask, grid: Grid, view: View = "front") -> float:
     """IoU of a stack's silhouette with a target (H, W); what is off the canvas counts as outside the target."""
     margin = grid.image_size
     half = (grid.image_size / 2 + margin) / grid.pixels_per_cell - 2
@@ -108,5 +108,5 @@ def silhouette_iou(stack: Stack, target: Mask, view: View = "front", grid: Grid 
     near = stack.poses.copy()
     near[:, :2] = np.clip(near[:, :2], -half, half)  # a block further out is still counted as outside
     near[:, 2] = np.clip(near[:, 2], middle - half, middle + half)
-    picture = silhouette(stack.with_poses(near), view, grid, margin)
+    picture = silhouette(stack.with_poses(near), grid, view, margin)
     return iou(picture, np.pad(np.asarray(target, dtype=bool), margin))

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, Catalogue
+from stackgen.world import PAPER_CATALOGUE, Catalogue
 
 Floats = NDArray[np.float64]
 
@@ -64,16 +64,14 @@ class Stack:
         return Stack(self.shapes, np.asarray(poses, dtype=np.float64), self.catalogue)
 
 
-def parse_block_list(
-    text: str, catalogue: Catalogue = PAPER_CATALOGUE, max_blocks: int = MAX_BLOCKS
-) -> NDArray[np.int64]:
+def parse_block_list(text: str, catalogue: Catalogue, max_blocks: int) -> NDArray[np.int64]:
     """Counts (S,) from `"cube=3,rectangle=2"`.
 
     Raises:
         StackgenError: On an unknown shape, a count that is not a whole number of at least 0,
             an empty list, or more than `max_blocks` blocks.
 
-    >>> parse_block_list("cube=3, triangle=1").tolist()
+    >>> parse_block_list("cube=3, triangle=1", PAPER_CATALOGUE, 10).tolist()
     [3, 0, 0, 1]
     """
     counts = np.zeros(len(catalogue), dtype=np.int64)
@@ -87,7 +85,7 @@ def parse_block_list(
     return counts
 
 
-def check_block_list(counts: ArrayLike, max_blocks: int = MAX_BLOCKS) -> None:
+def check_block_list(counts: ArrayLike, max_blocks: int) -> None:
     """Raise StackgenError unless the counts (S,) are those of 1..max_blocks blocks."""
     array = np.asarray(counts)
     if (array < 0).any():
@@ -96,10 +94,10 @@ def check_block_list(counts: ArrayLike, max_blocks: int = MAX_BLOCKS) -> None:
         raise StackgenError(f"block list: {int(array.sum())} blocks, but 1 to {max_blocks} are possible")
 
 
-def format_block_list(counts: ArrayLike, catalogue: Catalogue = PAPER_CATALOGUE) -> str:
+def format_block_list(counts: ArrayLike, catalogue: Catalogue) -> str:
     """Inverse of :func:`parse_block_list`; shapes with count 0 are left out.
 
-    >>> format_block_list([3, 0, 0, 1])
+    >>> format_block_list([3, 0, 0, 1], PAPER_CATALOGUE)
     'cube=3,triangle=1'
     """
     return ",".join(f"{name}={int(n)}" for name, n in zip(catalogue.names, np.asarray(counts), strict=True) if n)
