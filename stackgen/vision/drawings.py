@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stackgen.errors import StackgenError
+from stackgen.vision.masks import bounding_box, components
 from stackgen.world import PAPER_GRID, Grid, Mask
 
 if TYPE_CHECKING:
@@ -163,23 +164,20 @@ def _unlike_background(levels: Levels) -> Levels:
 
 def _structure(difference: Levels, scale: float) -> Mask:
     """The structure's pixels, cut out to its bounding box, at 768 pixels for the picture's longer edge."""
-    from PIL import Image
+    import cv2
 
     enlarge = max(1.0, _WORK_SIZE / max(difference.shape))
     if enlarge > 1:
         height, width = (round(n * enlarge) for n in difference.shape)
-        difference = np.asarray(
-            Image.fromarray(difference).resize((width, height), Image.Resampling.BILINEAR), dtype=np.float32
-        )
+        difference = np.asarray(cv2.resize(difference, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
     if np.quantile(difference, 0.999) < _CONTRAST:
         raise StackgenError("is all one colour, so nothing or everything is in it; draw a structure on a background")
-    mask = _without_specks(difference > _threshold(difference))
+    mask = _clean(difference > _threshold(difference))
     if mask.mean() > 0.98:
         raise StackgenError("the structure fills the whole frame; leave some background around it")
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    if not len(rows):
+    if not mask.any():
         raise StackgenError("nothing but specks is in it; draw a structure on a background")
-    cut = mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    cut = mask[bounding_box(mask)]
     if max(cut.shape) < _SMALLEST * enlarge * scale:
         raise _too_small("the structure in it", *(round(n / (enlarge * scale)) for n in cut.shape[::-1]))
     return cut
@@ -197,21 +195,20 @@ def _threshold(difference: Levels) -> float:
     A white house with a dark roof on grey has two steps. A paler part is told from a blurred edge by
     its thickness, and from uneven lighting by a clear step and by not reaching the picture's edge.
     """
-    from scipy import ndimage
+    import cv2
 
-    threshold = _otsu(difference.ravel())
-    thick = max(difference.shape) // 60
+    threshold = _otsu(difference)
+    thick = np.ones((2 * (max(difference.shape) // 60) + 1,) * 2, np.uint8)
     for _ in range(3):
         below = difference[difference <= threshold]
         lower = _otsu(below) if len(below) else 0.0
         paler = (difference > lower) & (difference <= threshold)
         in_between = np.abs(difference - lower) < 0.25 * lower
-        core = ndimage.minimum_filter(paler.view(np.uint8), size=2 * thick + 1).astype(bool)
-        labels, count = ndimage.label(core)
+        count, labels = cv2.connectedComponents(cv2.erode(paler.view(np.uint8), thick), connectivity=4)
         at_edge = np.unique(np.concatenate([labels[0], labels[:, 0], labels[:, -1]]))
         inside = np.isin(labels, at_edge, invert=True)
         enough = max(2 * _SPECK * np.count_nonzero(difference > threshold), 1)
-        if lower < _CONTRAST / 2 or not count or np.count_nonzero(inside) < enough:
+        if lower < _CONTRAST / 2 or count < 2 or np.count_nonzero(inside) < enough:
             return threshold
         if np.count_nonzero(in_between) > 0.3 * np.count_nonzero(paler):
             return threshold
@@ -219,43 +216,34 @@ def _threshold(difference: Levels) -> float:
     return threshold
 
 
-def _otsu(values: NDArray[np.float32]) -> float:
-    """The middle between two groups of values [0..255], split so that they differ most (Otsu 1979)."""
-    counts = np.bincount(np.clip(values, 0, 255).astype(np.int64), minlength=256).astype(np.float64)
-    sums = counts * np.arange(256)
-    n_low, s_low = np.cumsum(counts)[:-1], np.cumsum(sums)[:-1]
-    n_high, s_high = counts.sum() - n_low, sums.sum() - s_low
-    with np.errstate(divide="ignore", invalid="ignore"):
-        low, high = s_low / n_low, s_high / n_high
-        between = np.nan_to_num(n_low * n_high * (high - low) ** 2)
-    best = int(between.argmax())
-    return float(np.nan_to_num((low[best] + high[best]) / 2))
+def _otsu(values: Levels) -> float:
+    """The middle between the means of two groups of values [0..255], split by Otsu's method (1979)."""
+    import cv2
+
+    levels = np.clip(values, 0, 255).astype(np.uint8).ravel()
+    split, _ = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    is_low = levels <= split
+    return float((levels[is_low].mean() + levels[~is_low].mean()) / 2) if 0 < is_low.sum() < is_low.size else 0.0
 
 
-def _without_specks(mask: Mask) -> Mask:
+def _clean(mask: Mask) -> Mask:
     """The mask without parts, and without holes, that are tiny beside its largest part."""
-    from scipy import ndimage
-
-    labels, count = ndimage.label(mask)
-    if not count:
-        return mask
-    areas = np.bincount(labels.ravel())
-    areas[0] = 0
+    labels, areas = components(mask, connectivity=4)
     limit = _SPECK * areas.max()
-    kept = (areas >= limit)[labels]
-    holes, _ = ndimage.label(~kept)
-    return kept | (np.bincount(holes.ravel(), weights=~kept.ravel()) < limit)[holes]
+    kept = (areas >= max(limit, 1))[labels]
+    holes, sizes = components(~kept, connectivity=4)
+    return np.asarray(kept | (sizes < limit)[holes])
 
 
 def _fits(mask: Mask, grid: Grid) -> bool:
     """Whether a mask (image_size square) is placed and scaled as the grid's silhouettes are."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    inside = rows[0] > 0 and columns[0] > 0 and columns[-1] < grid.image_size - 1
-    on_ground = rows[-1] == round(grid.image_size - grid.ground_margin) - 1
-    height, width = np.ptp(rows) + 1, np.ptp(columns) + 1
+    rows, columns = bounding_box(mask)
+    inside = rows.start > 0 and columns.start > 0 and columns.stop < grid.image_size
+    on_ground = rows.stop == round(grid.image_size - grid.ground_margin)
     half = grid.pixels_per_cell / 2
+    height, width = rows.stop - rows.start, columns.stop - columns.start
     fills = abs(height - grid.height * 2 * half) <= half or abs(width - grid.width * 2 * half) <= half
-    return bool(inside and on_ground and fills)
+    return inside and on_ground and fills
 
 
 def _place(cut: Mask, grid: Grid) -> Mask:

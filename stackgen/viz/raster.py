@@ -1,4 +1,4 @@
-"""A small rasteriser: a camera, and convex polygons filled where they are nearest. Pure numpy.
+"""A small rasteriser in numpy: a camera, and convex polygons filled where they are nearest.
 
 Pixels are (column, row) from the upper left, with centres at halves.
 """
@@ -6,6 +6,7 @@ Pixels are (column, row) from the upper left, with centres at halves.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,11 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Camera:
-    """A perspective camera that looks at the scene from the front, from a little to one side and above.
+    """A perspective camera in front of the scene.
 
     Args:
         right, up, back: (3,) axes of the camera in the world; it looks along -back.
-        eye: (3,) its place in the world [cell].
+        eye: (3,) place of the camera in the world [cell].
         scale: Pixels per unit of tangent.
         center: (2,) the pixel (column, row) straight ahead.
     """
@@ -34,7 +35,7 @@ class Camera:
     center: Floats
 
     def project(self, points: Floats) -> tuple[Floats, Floats]:
-        """World points (..., 3) to pixels (..., 2) and to nearness (...) = 1 / distance along the axis [1/cell]."""
+        """Project world points (..., 3) to pixels (..., 2) and nearness (...), 1 / distance along the axis [1/cell]."""
         relative = points - self.eye
         nearness = -1 / (relative @ self.back)
         x = relative @ self.right * nearness
@@ -46,26 +47,32 @@ class Camera:
         """Place a camera so that all `points` (n, 3) fit into `size` (width, height) less a `border` [share].
 
         Args:
-            points: What must be seen.
-            size: Of the picture [pixel].
+            points: What must be seen [cell].
+            size: Width and height of the picture [pixel].
             azimuth: Angle to the right of the front [rad].
             elevation: Angle above the ground [rad].
             border: Share of each edge left free.
         """
-        back = np.array([np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
-        right = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        right, up, back = camera_axes(azimuth, elevation)
         low, high = points.min(axis=0), points.max(axis=0)
         eye = (low + high) / 2 + back * (2.2 * np.linalg.norm(high - low) + 1)
-        draft = Camera(right, np.cross(back, right), back, eye, 1.0, np.zeros(2))
+        draft = Camera(right, up, back, eye, 1.0, np.zeros(2))
         seen, _ = draft.project(points)
         room = np.array(size) * (1 - 2 * border)
         scale = float((room / np.maximum(np.ptp(seen, axis=0), 1e-9)).min())
         center = np.array(size) / 2 - scale * (seen.min(axis=0) + seen.max(axis=0)) / 2
-        return Camera(draft.right, draft.up, draft.back, eye, scale, center)
+        return Camera(right, up, back, eye, scale, center)
+
+
+def camera_axes(azimuth: float, elevation: float) -> tuple[Floats, Floats, Floats]:
+    """Return the axes (right, up, back) of a camera to the right of the front and above the ground [rad]."""
+    back = np.array([np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
+    right = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    return right, np.cross(back, right), back
 
 
 def prism_faces(shape: Shape) -> list[list[int]]:
-    """Corners of each face of a prism, counter-clockwise seen from outside, as indices into its vertices.
+    """List the corners of each face of a prism as indices into its vertices, counter-clockwise seen from outside.
 
     >>> prism_faces(Shape("wedge", ((-1, -1), (1, -1), (0, 1))))
     [[0, 1, 2], [5, 4, 3], [0, 3, 4, 1], [1, 4, 5, 2], [2, 5, 3, 0]]
@@ -78,7 +85,7 @@ def prism_faces(shape: Shape) -> list[list[int]]:
 def fill_nearest(
     faces: NDArray[np.int32], nearest: NDArray[np.float32], number: int, pixels: Floats, nearness: Floats
 ) -> None:
-    """Write `number` where the face is nearer than what is there; nearness is linear on the screen."""
+    """Write `number` where a convex face is nearer than what is there; nearness is linear on the screen."""
     window = _covered(faces.shape, pixels)
     if window is None:
         return
@@ -91,14 +98,6 @@ def fill_nearest(
     wins = inside & (near > nearest[rows, columns] * (1 + 1e-6))
     faces[rows, columns][wins] = number
     nearest[rows, columns][wins] = near[wins]
-
-
-def fill(mask: NDArray[np.bool_], polygon: Floats) -> None:
-    """Set the pixels of a convex polygon (n, 2)."""
-    window = _covered(mask.shape, polygon)
-    if window is not None:
-        rows, columns, inside = window
-        mask[rows, columns] |= inside
 
 
 def _covered(shape: tuple[int, ...], polygon: Floats) -> tuple[slice, slice, NDArray[np.bool_]] | None:
@@ -123,24 +122,12 @@ def _covered(shape: tuple[int, ...], polygon: Floats) -> tuple[slice, slice, NDA
     return slice(y0, y1), slice(x0, x1), (x >= low) & (x < high)
 
 
-def hull(points: Floats) -> Floats:
-    """Corners of the convex hull of points (n, 2), in order."""
-    from scipy.spatial import ConvexHull
-
-    return points[ConvexHull(points, qhull_options="QJ").vertices]
-
-
-def borders(labels: NDArray[np.integer], grow: int) -> NDArray[np.bool_]:
-    """Pixels (H, W) beside another label, and all within `grow` pixels of them."""
-    border = np.zeros(labels.shape, dtype=bool)
-    across, down = labels[:, 1:] != labels[:, :-1], labels[1:] != labels[:-1]
-    border[:, 1:] |= across
-    border[:, :-1] |= across
-    border[1:] |= down
-    border[:-1] |= down
-    for _ in range(grow):
-        border[:, 1:] |= border[:, :-1]
-        border[:, :-1] |= border[:, 1:]
-        border[1:] |= border[:-1]
-        border[:-1] |= border[1:]
+def borders(values: NDArray[Any], step: float = 0.0) -> NDArray[np.bool_]:
+    """Find the pixels (H, W) that differ by more than `step` from the one beside, above or below."""
+    border = np.zeros(values.shape, dtype=bool)
+    for axis in (0, 1):
+        differs = np.swapaxes(np.abs(np.diff(values, axis=axis)) > step, 0, axis)
+        along = np.swapaxes(border, 0, axis)
+        along[1:] |= differs
+        along[:-1] |= differs
     return border

@@ -1,4 +1,4 @@
-"""Pictures of stacks for people: drawn with numpy alone, no window, no graphics driver.
+"""Pictures of stacks for people, drawn without a window or a graphics driver.
 
 Every visible face of a prism is a convex polygon on the screen, filled where it is nearest;
 outlines run where neighbouring pixels show different faces.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +21,7 @@ from stackgen.geometry import block_vertices
 from stackgen.io.files import write_atomically
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
-from stackgen.viz.raster import Camera, borders, fill, fill_nearest, hull, prism_faces
+from stackgen.viz.raster import Camera, borders, fill_nearest, prism_faces
 from stackgen.world import PAPER_GRID, Grid, Mask
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ _FAR = 100.0  # [cell] blocks further out are drawn at this distance
 
 
 def shape_colour(index: int) -> Colour:
-    """The colour of the catalogue's shape `index`."""
+    """Return the colour of the catalogue's shape `index`."""
     return SHAPE_COLOURS[index % len(SHAPE_COLOURS)]
 
 
@@ -66,24 +66,29 @@ def render_stack(
     grid: Grid = PAPER_GRID,
     supersample: int = 2,
 ) -> Picture:
-    """A three-quarter view (H, W, 3) of a stack on the ground.
+    """Draw a three-quarter view (H, W, 3) of a stack on the ground.
 
     The camera always shows the whole design grid and all blocks, so stacks within the grid appear at
     one scale.
 
     Args:
-        stack: What to draw; blocks may float or overlap.
+        stack: The stack; its blocks may float or overlap.
         size: (width, height) [pixel].
         fallen: (k,) blocks to outline in red.
         azimuth: Angle of the camera to the right of the front [rad].
         elevation: Angle of the camera above the ground [rad].
-        grid: Whose extent is always in view.
-        supersample: Drawn so many times larger, then averaged: smooth edges.
+        grid: Design grid, whose extent is always in view.
+        supersample: Factor by which the picture is drawn larger before it is averaged, for smooth edges.
+
+    Raises:
+        StackgenError: If `fallen` is not one value for each block.
 
     >>> picture = render_stack(Stack([0], [[0, 0, 0.5, 0, 0, 0]]), size=(160, 120))
     >>> picture.shape, picture.dtype
     ((120, 160, 3), dtype('uint8'))
     """
+    import cv2
+
     marked = np.zeros(len(stack), dtype=bool) if fallen is None else np.asarray(fallen, dtype=bool)
     if marked.shape != (len(stack),):
         raise StackgenError(f"fallen must say yes or no for each of {len(stack)} blocks, got shape {marked.shape}")
@@ -95,39 +100,38 @@ def render_stack(
     large = (size[0] * supersample, size[1] * supersample)
     camera = Camera.looking_at(np.concatenate([room, *blocks]), large, azimuth, elevation, border=0.06)
     canvas = _ground(large, camera, blocks)
-    faces = _draw_faces(stack, blocks, camera, large)
+    faces = draw_faces(stack, blocks, camera, np.zeros(canvas.shape[:2], dtype=np.float32), _shade)
     shown = faces.seen > 0
     canvas[shown] = faces.colours[faces.seen[shown]]
     _draw_outlines(canvas, faces, marked, supersample)
-    shape = (size[1], supersample, size[0], supersample, 3)
-    return np.round(canvas.reshape(shape).mean(axis=(1, 3))).astype(np.uint8)
+    return np.round(cv2.resize(canvas, size, interpolation=cv2.INTER_AREA)).astype(np.uint8)
 
 
 def _ground(size: tuple[int, int], camera: Camera, blocks: Sequence[Floats]) -> NDArray[np.float32]:
-    """The empty picture: ground that fades into the sky, with the blocks' soft shadows on it."""
-    from PIL import Image, ImageFilter
+    """Draw the empty picture: ground that fades into the sky, with the blocks' soft shadows on it."""
+    import cv2
 
     width, height = size
     fade = np.clip((np.arange(height) / height - 0.45) / 0.5, 0, 1)[:, None, None]
-    shadow = np.zeros((height, width), dtype=bool)
+    step = 4  # a blurred shadow needs no detail
+    shadow = np.zeros((height // step, width // step), dtype=np.uint8)
     for corners in blocks:
         above = np.maximum(corners[:, 2:], 0)
-        fill(shadow, hull(camera.project((corners - above * _LIGHT / _LIGHT[2]) * [1, 1, 0])[0]))
-    step = 4  # a blurred shadow needs no detail
-    small = Image.fromarray(shadow[::step, ::step].astype(np.uint8) * 255)
-    soft = small.filter(ImageFilter.GaussianBlur(width / 130 / step)).resize(size, Image.Resampling.BILINEAR)
-    dark = 1 - 0.30 * np.asarray(soft, dtype=np.float32)[..., None] / 255
+        pixels, _ = camera.project((corners - above * _LIGHT / _LIGHT[2]) * [1, 1, 0])
+        cv2.fillConvexPoly(shadow, cv2.convexHull(np.round(pixels / step - 0.5).astype(np.int32)), 255)
+    soft = cv2.resize(cv2.GaussianBlur(shadow, (0, 0), width / 130 / step), size).astype(np.float32)
+    dark = 1 - 0.30 * soft[..., None] / 255
     return ((_SKY + (_GROUND - _SKY) * fade).astype(np.float32) * dark).astype(np.float32)
 
 
 @dataclass(frozen=True)
-class _Faces:
-    """What the picture shows.
+class Faces:
+    """The faces that a picture shows.
 
     Args:
         seen: (H, W) number of the face at each pixel, 0 for none.
-        colours: (faces, 3) of each face; of number 0, anything.
-        blocks: (faces,) the block each belongs to; -1 for number 0.
+        colours: (faces, 3) colour of each face; that of number 0 has no meaning.
+        blocks: (faces,) the block each face belongs to; -1 for number 0.
     """
 
     seen: NDArray[np.int32]
@@ -135,40 +139,58 @@ class _Faces:
     blocks: NDArray[np.int64]
 
 
-def _draw_faces(stack: Stack, blocks: Sequence[Floats], camera: Camera, size: tuple[int, int]) -> _Faces:
-    """Fill every face turned to the camera where it is the nearest."""
-    seen = np.zeros((size[1], size[0]), dtype=np.int32)
-    nearest = np.zeros((size[1], size[0]), dtype=np.float32)
+def draw_faces(
+    stack: Stack,
+    blocks: Sequence[Floats],
+    camera: Camera,
+    nearest: NDArray[np.float32],
+    shade: Callable[[Floats, Floats], Floats],
+) -> Faces:
+    """Fill every face that is turned to the camera where it is the nearest.
+
+    Args:
+        stack: Gives the blocks' shapes.
+        blocks: Corners (V, 3) of each block in the world [cell].
+        camera: The camera.
+        nearest: (H, W) nearness of what is seen already [1/cell]; that of the faces is written into it.
+        shade: Colour (3,) of a face from the colour of its shape and its outward unit normal, (3,) each.
+    """
+    seen = np.zeros(nearest.shape, dtype=np.int32)
     colours, owners = [np.zeros(3)], [-1]
     for block, (index, corners) in enumerate(zip(stack.shapes, blocks, strict=True)):
         base = np.array(shape_colour(index), dtype=np.float64)
         for face in prism_faces(stack.catalogue[index]):
             polygon = corners[face]
             normal = np.cross(polygon[1] - polygon[0], polygon[2] - polygon[0])
-            if (camera.eye - polygon[0]) @ normal <= 0:
-                continue
-            pixels, nearness = camera.project(polygon)
-            fill_nearest(seen, nearest, len(colours), pixels, nearness)
-            colours.append(_shade(base, normal / np.linalg.norm(normal)))
-            owners.append(block)
-    return _Faces(seen, np.array(colours, dtype=np.float32), np.array(owners))
+            if (camera.eye - polygon[0]) @ normal > 0:
+                fill_nearest(seen, nearest, len(colours), *camera.project(polygon))
+                colours.append(shade(base, normal / np.linalg.norm(normal)))
+                owners.append(block)
+    return Faces(seen, np.array(colours, dtype=np.float32), np.array(owners))
 
 
 def _shade(base: Floats, normal: Floats) -> Floats:
-    """A face's colour in soft light: what points to the light is bright, what points up sees the sky."""
+    """Shade a face in soft light: what points to the light is bright, what points up sees the sky."""
     light = 0.68 + 0.34 * max(0.0, float(normal @ _LIGHT)) + 0.14 * max(0.0, normal[2])
     return np.clip(base * light + 255 * 0.22 * max(0.0, light - 0.8), 0, 255)
 
 
-def _draw_outlines(canvas: NDArray[np.float32], faces: _Faces, fallen: NDArray[np.bool_], supersample: int) -> None:
+def _draw_outlines(canvas: NDArray[np.float32], faces: Faces, fallen: NDArray[np.bool_], supersample: int) -> None:
     """Darken the edges between faces, more between blocks, and draw fallen blocks' outlines thick and red."""
     blocks = faces.blocks[faces.seen]
-    canvas[borders(faces.seen, 0)] *= 0.72
-    thin = borders(blocks, supersample // 2)
+    canvas[borders(faces.seen)] *= 0.72
+    thin = _thick(borders(blocks), supersample // 2)
     canvas[thin] = canvas[thin] * 0.25 + np.array(_LINE, dtype=np.float32) * 0.75
     if fallen.any():
         is_fallen = np.append(fallen, False)[blocks]  # block -1, nothing, did not fall
-        canvas[borders(np.where(is_fallen, blocks, -1), supersample + supersample // 2)] = FALLEN
+        canvas[_thick(borders(np.where(is_fallen, blocks, -1)), supersample + supersample // 2)] = FALLEN
+
+
+def _thick(line: NDArray[np.bool_], grow: int) -> NDArray[np.bool_]:
+    """Add all pixels within `grow` pixels of a line (H, W)."""
+    import cv2
+
+    return np.asarray(cv2.dilate(line.view(np.uint8), np.ones((2 * grow + 1,) * 2, np.uint8)), dtype=bool)
 
 
 _PANEL = 300  # [pixel] edge of each picture of a contact sheet
@@ -187,17 +209,20 @@ def contact_sheet(
     title: str = "",
     grid: Grid = PAPER_GRID,
 ) -> Picture:
-    """One picture (H, W, 3) of what was asked for and of every stack as it was sampled, with its verdict.
+    """Draw the target and every stack as it was sampled, with its verdict, in one picture (H, W, 3).
 
     Blocks are numbered from 0, as in `stacks.json`; those that fell are outlined in red.
 
     Args:
         target: Silhouette asked for, shown at the left; None leaves it out.
-        stacks: Shown in this order, four pictures a row.
-        verdicts: One for each stack, where there is one.
-        ious: Front IoU of each stack, where there is one.
+        stacks: The stacks, shown in this order, four pictures a row.
+        verdicts: Verdict on each stack, or None.
+        ious: Front IoU of each stack, or None.
         title: Headline; none if empty.
-        grid: Of the target and the stacks.
+        grid: Design grid of the stacks.
+
+    Raises:
+        StackgenError: If there are not as many verdicts or IoUs as stacks.
     """
     from PIL import Image, ImageDraw
 
@@ -228,7 +253,7 @@ def contact_sheet(
 
 
 def _target_picture(target: Mask) -> Picture:
-    """The silhouette, dark on light, each pixel a square."""
+    """Draw the silhouette dark on light, each pixel a square."""
     from PIL import Image
 
     mask = np.asarray(target, dtype=bool)
@@ -237,7 +262,7 @@ def _target_picture(target: Mask) -> Picture:
 
 
 def _caption(number: int, stack: Stack, verdict: Verdict | None, score: float | None) -> list[tuple[str, Colour]]:
-    """The two lines under a stack: what became of it, and how well it matches."""
+    """Write the two lines under a stack: its verdict, and how well it matches."""
     match = "" if score is None else f"front IoU {score:.2f}"
     if verdict is None:
         return [(f"{number}", _LINE), (match, _MUTED)]
@@ -251,7 +276,7 @@ def _caption(number: int, stack: Stack, verdict: Verdict | None, score: float | 
 
 
 def _write(pen: ImageDraw, place: tuple[int, int], text: str, size: int, colour: Colour, width: int) -> None:
-    """Text in Pillow's own font, shortened to `width` [pixel]."""
+    """Write text in Pillow's own font, shortened to `width` [pixel]."""
     from PIL import ImageFont
 
     font = ImageFont.load_default(size)
@@ -266,7 +291,7 @@ def save_image(path: str | Path, picture: ArrayLike) -> None:
     """Write a picture (H, W, 3) uint8, or a mask (H, W) bool, as PNG or JPEG by the suffix of `path`.
 
     Raises:
-        StackgenError: If the suffix is another, or the file cannot be written.
+        StackgenError: If the suffix is another one, or the file cannot be written.
     """
     from PIL import Image
 

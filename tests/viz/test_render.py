@@ -15,9 +15,9 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import iou, silhouette
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
-from stackgen.viz.raster import Camera, fill, prism_faces
+from stackgen.viz.raster import Camera, borders, fill_nearest, prism_faces
 from stackgen.viz.render import FALLEN, contact_sheet, render_stack, save_image
-from stackgen.world import PAPER_CATALOGUE, Shape
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Shape
 
 ONE_EACH = Stack(np.arange(4), np.array([[-1.5, 0, 0.5], [0.2, 0, 0.5], [0, 0, 1.5], [0, 0, 2.5]]) @ np.eye(3, 6))
 
@@ -52,7 +52,7 @@ def test_each_shape_has_its_own_colour_and_none_is_red() -> None:
 def test_seen_from_straight_ahead_the_picture_is_the_silhouette() -> None:
     picture = coloured(render_stack(ONE_EACH, (400, 400), azimuth=0, elevation=0))
     shown = picture[np.ix_(np.flatnonzero(picture.any(1)), np.flatnonzero(picture.any(0)))]
-    truth = silhouette(ONE_EACH)
+    truth = silhouette(ONE_EACH, PAPER_GRID)
     truth = truth[np.ix_(np.flatnonzero(truth.any(1)), np.flatnonzero(truth.any(0)))]
     scaled = Image.fromarray(truth).resize(shown.shape[::-1], Image.Resampling.NEAREST)
     assert iou(shown, np.asarray(scaled)) > 0.93
@@ -108,16 +108,28 @@ def test_size_and_smoothness() -> None:
     assert np.abs(rough - fine).mean() < 12
 
 
-def test_a_filled_polygon_has_its_area_and_neighbours_share_no_pixel() -> None:
-    a, b = np.zeros((80, 90), bool), np.zeros((80, 90), bool)
-    fill(a, np.array([[10.3, 5.2], [60.7, 20.1], [30.9, 70.5]]))
-    fill(b, np.array([[60.7, 20.1], [10.3, 5.2], [70.2, 3.3]]))
+def test_a_filled_face_has_its_area_and_neighbours_share_no_pixel() -> None:
+    a, b, off = (np.zeros((80, 90), np.int32) for _ in range(3))
+    for picture, corners in (
+        (a, [[10.3, 5.2], [60.7, 20.1], [30.9, 70.5]]),
+        (b, [[60.7, 20.1], [10.3, 5.2], [70.2, 3.3]]),
+        (off, [[-50.0, -50], [-10, -50], [-10, -10]]),
+    ):
+        fill_nearest(picture, np.zeros(picture.shape, np.float32), 1, np.array(corners), np.ones(3))
     area = abs(np.cross([50.4, 14.9, 0], [20.6, 65.3, 0])[2]) / 2
     assert a.sum() == pytest.approx(area, rel=0.01)
     assert not (a & b).any()
-    off = np.zeros((80, 90), bool)
-    fill(off, np.array([[-50.0, -50], [-10, -50], [-10, -10]]))
     assert not off.any()
+
+
+def test_borders_are_the_pixels_on_both_sides_of_a_step() -> None:
+    values = np.zeros((6, 7))
+    values[2:4, 3:] = [[0.5, 0.5, 0.5, 0.5], [2, 2, 2, 2]]
+    rows, columns = np.nonzero(borders(values, 1.0))
+    assert sorted(set(zip(rows.tolist(), columns.tolist(), strict=True))) == sorted(
+        {(3, 2), *((row, column) for row in (2, 3, 4) for column in range(3, 7))}
+    )
+    assert not borders(values, 2.0).any() and borders(values).sum() == 4 * 4 + 2
 
 
 def test_the_camera_sees_all_points_and_nearer_is_nearer() -> None:
@@ -145,7 +157,7 @@ def test_faces_are_planar_face_outwards_and_enclose_the_volume(shape: Shape) -> 
 def test_a_contact_sheet_has_a_panel_for_each_and_tells_what_fell() -> None:
     stands = Verdict(True, np.zeros(4, bool), np.zeros(4), ONE_EACH)
     falls = Verdict(False, np.arange(4) == 2, np.array([0, 0, 1.5, 0.1]), ONE_EACH)
-    target = silhouette(ONE_EACH)
+    target = silhouette(ONE_EACH, PAPER_GRID)
     sheet = contact_sheet(target, [ONE_EACH, ONE_EACH, ONE_EACH], [stands, falls, None], [0.91, 0.0, None], "arch.png")
     width = sheet.shape[1] // 4
     reds = [red(sheet[:, i * width : (i + 1) * width]).sum() for i in range(4)]
@@ -171,8 +183,8 @@ def test_an_image_is_saved_by_its_suffix(suffix: str, tmp_path: Path) -> None:
     save_image(tmp_path / f"a{suffix}", picture)
     back = np.asarray(Image.open(tmp_path / f"a{suffix}")).astype(int)
     assert np.abs(back - picture).mean() < (0.1 if suffix == ".png" else 6)
-    save_image(tmp_path / "mask.png", silhouette(ONE_EACH))
-    assert (np.asarray(Image.open(tmp_path / "mask.png")) == silhouette(ONE_EACH) * 255).all()
+    save_image(tmp_path / "mask.png", silhouette(ONE_EACH, PAPER_GRID))
+    assert (np.asarray(Image.open(tmp_path / "mask.png")) == silhouette(ONE_EACH, PAPER_GRID) * 255).all()
     with pytest.raises(StackgenError, match="suffix"):
         save_image(tmp_path / "a.gif", picture)
     assert len(list(tmp_path.iterdir())) == 2
@@ -181,9 +193,10 @@ def test_an_image_is_saved_by_its_suffix(suffix: str, tmp_path: Path) -> None:
 def test_drawing_needs_no_torch_and_no_matplotlib() -> None:
     code = (
         "import sys, numpy as np; from stackgen.viz.render import *; from stackgen.stack import Stack;"
+        "import stackgen.viz.raster, stackgen.vision.drawings; assert 'cv2' not in sys.modules;"
         "contact_sheet(np.eye(64) > 0, [Stack([0], [[0, 0, 0.5, 0, 0, 0]])]);"
         "import stackgen.viz.export, stackgen.vision.drawings, stackgen.io.stacks_file;"
-        "print([m for m in ('torch', 'matplotlib', 'cv2', 'trimesh', 'pybullet', 'jsonschema') if m in sys.modules])"
+        "print([m for m in ('torch', 'matplotlib', 'trimesh', 'pybullet', 'jsonschema') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
