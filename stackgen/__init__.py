@@ -7,7 +7,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from stackgen._lazy import lazy
 
 if TYPE_CHECKING:
     from stackgen.api import Model, load, sample
@@ -16,18 +18,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Model", "Stack", "StackgenError", "load", "sample"]
 
-_HOME = {"Stack": "stackgen.stack", "StackgenError": "stackgen.stack"}
-
-
-def __getattr__(name: str) -> Any:
-    """Import a name when it is first asked for, so that `import stackgen` costs nothing."""
-    if name not in __all__:
-        raise AttributeError(f"module 'stackgen' has no attribute {name!r}")
-    import importlib
-
-    value = getattr(importlib.import_module(_HOME.get(name, "stackgen.api")), name)
-    globals()[name] = value
-    return value
+__getattr__ = lazy(
+    __name__, {"Stack": "stack", "StackgenError": "errors", **dict.fromkeys(("Model", "load", "sample"), "api")}
+)
 
 
 def __dir__() -> list[str]:

@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+from stackgen._lazy import lazy
 from stackgen.baselines.brute_force import BruteForce
 from stackgen.baselines.greedy_random import GreedyRandom
 from stackgen.baselines.heuristic import Heuristic
 from stackgen.baselines.random_placement import RandomPlacement
+
+if TYPE_CHECKING:
+    from stackgen.baselines.modules import TranReg, TranVAE
+
+__all__ = ["HEURISTICS", "BruteForce", "GreedyRandom", "RandomPlacement", "TranReg", "TranVAE"]
+
+__getattr__ = lazy(__name__, {"TranReg": "modules", "TranVAE": "modules"})
 
 HEURISTICS: dict[str, type[Heuristic]] = {kind.kind: kind for kind in (BruteForce, GreedyRandom, RandomPlacement)}
 """By the name that stands for them where weights are asked for; there they have their default settings."""

@@ -1,0 +1,35 @@
+"""Datasets of stacks: opened, read by training, generated and inspected.
+
+>>> import webdataset as wds
+>>> from stackgen.data import Dataset, decode, to_batch
+>>> testset = Dataset.open("stackgen/assets/testset-v1")
+>>> urls = [shard.path for shard in testset.shards("test")]
+>>> batches = wds.WebDataset(urls, shardshuffle=False).map(decode).batched(64, collation_fn=to_batch)
+>>> next(iter(batches))["silhouette"].shape
+torch.Size([64, 64, 64])
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from stackgen._lazy import lazy
+
+if TYPE_CHECKING:
+    from stackgen.data.arrays import to_batch
+    from stackgen.data.datamodule import StackDataModule
+    from stackgen.data.dataset import TESTSET, Dataset
+    from stackgen.data.shards import decode
+
+__all__ = ["TESTSET", "Dataset", "StackDataModule", "decode", "to_batch"]
+
+__getattr__ = lazy(
+    __name__,
+    {
+        "TESTSET": "dataset",
+        "Dataset": "dataset",
+        "StackDataModule": "datamodule",
+        "decode": "shards",
+        "to_batch": "arrays",
+    },
+)

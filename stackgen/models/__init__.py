@@ -1,0 +1,19 @@
+"""The paper's networks: the diffusion model of poses and the classifier of block lists, and how they are trained."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from stackgen._lazy import lazy
+
+if TYPE_CHECKING:
+    from stackgen.models.block_list.module import BlockListCNN
+    from stackgen.models.diffusion.module import DDPM
+    from stackgen.models.diffusion.preference import VerdictTuning
+
+__all__ = ["DDPM", "BlockListCNN", "VerdictTuning"]
+
+__getattr__ = lazy(
+    __name__,
+    {"BlockListCNN": "block_list.module", "DDPM": "diffusion.module", "VerdictTuning": "diffusion.preference"},
+)
