@@ -18,10 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Model", "Stack", "StackgenError", "load", "sample"]
 
-__getattr__ = lazy(
+__getattr__, __dir__ = lazy(
     __name__, {"Stack": "stack", "StackgenError": "errors", **dict.fromkeys(("Model", "load", "sample"), "api")}
 )
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})

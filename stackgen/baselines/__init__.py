@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["HEURISTICS", "BruteForce", "GreedyRandom", "RandomPlacement", "TranReg", "TranVAE"]
 
-__getattr__ = lazy(__name__, {"TranReg": "modules", "TranVAE": "modules"})
+__getattr__, __dir__ = lazy(__name__, {"TranReg": "modules", "TranVAE": "modules"})
 
 HEURISTICS: dict[str, type[Heuristic]] = {kind.kind: kind for kind in (BruteForce, GreedyRandom, RandomPlacement)}
 """By the name that stands for them where weights are asked for; there they have their default settings."""

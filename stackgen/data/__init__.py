@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["TESTSET", "Dataset", "StackDataModule", "decode", "to_batch"]
 
-__getattr__ = lazy(
+__getattr__, __dir__ = lazy(
     __name__,
     {
         "TESTSET": "dataset",

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DDPM", "BlockListCNN", "VerdictTuning"]
 
-__getattr__ = lazy(
+__getattr__, __dir__ = lazy(
     __name__,
     {"BlockListCNN": "block_list.module", "DDPM": "diffusion.module", "VerdictTuning": "diffusion.preference"},
 )

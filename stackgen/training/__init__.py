@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 __all__ = ["EMA", "CheckpointArtifact", "Compile", "SampleQuality", "StartFrom", "StepMetrics", "Throughput"]
 
-__getattr__ = lazy(
+__getattr__, __dir__ = lazy(
     __name__,
     {name: "plots" if name in ("CheckpointArtifact", "StepMetrics") else "callbacks" for name in __all__},
 )

@@ -12,7 +12,7 @@ import yaml
 import stackgen
 from stackgen.baselines import HEURISTICS
 from stackgen.commands.test import WeightsUnderTest
-from stackgen.data.datamodule import TESTSET
+from stackgen.data.dataset import TESTSET
 from stackgen.errors import StackgenError
 from stackgen.evaluation.protocol import load_scenes
 from stackgen.io.stacks_file import read_stacks
@@ -124,7 +124,7 @@ def test_sample_on_the_command_line(cli: Cli, tower_image: Path, tmp_path: Path)
 def test_a_configuration_holds_the_settings_that_the_name_stands_for(name: str) -> None:
     model = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())["test"]["model"]
     weights = model["init_args"]["weights"]
-    assert weights["class_path"] == f"{HEURISTICS[name].__module__}.{HEURISTICS[name].__name__}"
+    assert weights["class_path"] == f"stackgen.baselines.{HEURISTICS[name].__name__}"
     assert weights.get("init_args", {}) == HEURISTICS[name]().settings
 
 

@@ -27,7 +27,7 @@ _OTHER = 2**32
 
 
 class VerdictTuning(DDPM):
-    """A DDPM that learns from pairs too; begin from trained weights, with `stackgen.training.callbacks.StartFrom`.
+    """A DDPM that learns from pairs too; begin from trained weights, with `stackgen.training.StartFrom`.
 
     Its checkpoints are those of a DDPM.
 
