@@ -22,7 +22,7 @@ from stackgen.io.files import write_atomically
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
 from stackgen.viz.raster import Camera, borders, fill_nearest, prism_faces
-from stackgen.world import PAPER_GRID, Grid, Mask
+from stackgen.world import Grid, Mask
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
@@ -63,7 +63,8 @@ def render_stack(
     fallen: ArrayLike | None = None,
     azimuth: float = 0.38,
     elevation: float = 0.26,
-    grid: Grid = PAPER_GRID,
+    *,
+    grid: Grid,
     supersample: int = 2,
 ) -> Picture:
     """Draw a three-quarter view (H, W, 3) of a stack on the ground.
@@ -83,7 +84,7 @@ def render_stack(
     Raises:
         StackgenError: If `fallen` is not one value for each block.
 
-    >>> picture = render_stack(Stack([0], [[0, 0, 0.5, 0, 0, 0]]), size=(160, 120))
+    >>> picture = render_stack(Stack([0], [[0, 0, 0.5, 0, 0, 0]]), size=(160, 120), grid=Grid())
     >>> picture.shape, picture.dtype
     ((120, 160, 3), dtype('uint8'))
     """
@@ -207,7 +208,8 @@ def contact_sheet(
     verdicts: Sequence[Verdict | None] | None = None,
     ious: Sequence[float | None] | None = None,
     title: str = "",
-    grid: Grid = PAPER_GRID,
+    *,
+    grid: Grid,
 ) -> Picture:
     """Draw the target and every stack as it was sampled, with its verdict, in one picture (H, W, 3).
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +16,13 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import iou, silhouette
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
+from stackgen.viz import render
 from stackgen.viz.raster import Camera, borders, fill_nearest, prism_faces
-from stackgen.viz.render import FALLEN, contact_sheet, render_stack, save_image
+from stackgen.viz.render import FALLEN, save_image
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Shape
 
+render_stack = partial(render.render_stack, grid=PAPER_GRID)
+contact_sheet = partial(render.contact_sheet, grid=PAPER_GRID)
 ONE_EACH = Stack(np.arange(4), np.array([[-1.5, 0, 0.5], [0.2, 0, 0.5], [0, 0, 1.5], [0, 0, 2.5]]) @ np.eye(3, 6))
 
 
@@ -194,7 +198,7 @@ def test_drawing_needs_no_torch_and_no_matplotlib() -> None:
     code = (
         "import sys, numpy as np; from stackgen.viz.render import *; from stackgen.stack import Stack;"
         "import stackgen.viz.raster, stackgen.vision.drawings; assert 'cv2' not in sys.modules;"
-        "contact_sheet(np.eye(64) > 0, [Stack([0], [[0, 0, 0.5, 0, 0, 0]])]);"
+        "contact_sheet(np.eye(64) > 0, [Stack([0], [[0, 0, 0.5, 0, 0, 0]])], grid=Grid());"
         "import stackgen.viz.export, stackgen.vision.drawings, stackgen.io.stacks_file;"
         "print([m for m in ('torch', 'matplotlib', 'trimesh', 'pybullet', 'jsonschema') if m in sys.modules])"
     )
