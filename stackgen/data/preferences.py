@@ -1,15 +1,14 @@
 """Pairs of stacks for one silhouette and block list, one better than the other: what verdicts teach.
 
-A sampler's own failures say what its training data cannot: which layouts it is tempted by and must
-leave. Each is paired with a stack that stands and matches. Needs numpy and torch alone; the simulator
-is handed in.
+A sampler's own failures say what its training data cannot: which stacks it is tempted by and must leave.
+Each is paired with a stack that stands and matches.
 
 Legend: P pairs, N blocks at most, n samples a scene.
 """
 
 from __future__ import annotations
 
-import os
+import io
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,11 +17,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.data.loading.arrays import PADDING, StackArrays
+from stackgen.data.arrays import PADDING, StackArrays
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
-from stackgen.protocols import StabilityChecker, StackSampler, Verdict, check_all
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid
+from stackgen.io.files import write_atomically
+from stackgen.protocols import StabilityChecker, StackSampler
 
 _SCENES_AT_ONCE = 128
 
@@ -32,8 +31,8 @@ class Preferences:
     """P pairs; a pair's two stacks have the same blocks in the same order, and one silhouette.
 
     Args:
-        better: Stand and match.
-        worse: Fall, or do not match.
+        better: Stacks that stand and match.
+        worse: Stacks that fall, or do not match.
 
     Raises:
         StackgenError: If they do not belong together.
@@ -50,30 +49,21 @@ class Preferences:
         return len(self.better)
 
     def save(self, path: Path) -> None:
-        """Write as `.npz`.
+        """Write as `.npz`, whole or not at all.
 
         Raises:
             StackgenError: If it cannot be written.
         """
         if path.suffix != ".npz":
             raise StackgenError(f"preferences are written to a .npz file, not {path.name}")
-        temporary = path.with_name(f".{path.stem}.{os.getpid()}.npz")
-        parts = {name: getattr(self.better, name) for name in ("shapes", "silhouettes", "template")}
-        sizes = {"num_shapes": np.array(self.better.num_shapes)}
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            np.savez_compressed(
-                temporary, allow_pickle=False, better=self.better.poses, worse=self.worse.poses, **parts, **sizes
-            )
-            os.replace(temporary, path)
-        except OSError as error:
-            raise StackgenError(f"cannot write {path}: {error.strerror or error}") from error
-        finally:
-            temporary.unlink(missing_ok=True)
+        shared = {name: getattr(self.better, name) for name in ("shapes", "silhouettes", "template", "num_shapes")}
+        file = io.BytesIO()
+        np.savez_compressed(file, allow_pickle=False, better=self.better.poses, worse=self.worse.poses, **shared)
+        write_atomically(path, file.getvalue())
 
     @staticmethod
     def load(path: str | Path) -> Preferences:
-        """Inverse of :meth:`save`.
+        """Read what :meth:`save` wrote.
 
         Raises:
             StackgenError: If the file is missing, broken, or not such a file.
@@ -96,27 +86,25 @@ def prefer(
     sampler: StackSampler,
     checker: StabilityChecker,
     stacks: StackArrays,
+    *,
     num_samples: int = 3,
     seed: int = 0,
     iou: float = 0.95,
-    catalogue: Catalogue = PAPER_CATALOGUE,
-    grid: Grid = PAPER_GRID,
     progress: Callable[[int], None] = lambda scenes: None,
 ) -> Preferences:
-    """Sample for the silhouettes and block lists of some stacks, judge, and pair each failure with a success.
+    """Sample for the silhouettes and block lists of some stacks, check, and pair each failure with a success.
 
     The success is another sample of the same scene in about half of the pairs, where there is one: what the
-    sampler can do already; the true stack else, so that no way of standing is forgotten.
+    sampler can do already. Otherwise it is the true stack, so that no way of standing is forgotten.
 
     Args:
-        sampler: Whom to teach.
-        checker: The physics.
-        stacks: Of the training split.
-        num_samples: n.
-        seed: Same seed, same pairs.
-        iou: A success stands, and its settled front silhouette matches at least this well.
-        catalogue, grid: Of the stacks.
-        progress: Told the number of scenes done.
+        sampler: The sampler that is to learn.
+        checker: Says which samples stand.
+        stacks: Stacks of the training split, of the sampler's world.
+        num_samples: Samples for each stack, n.
+        seed: The same seed gives the same pairs.
+        iou: Least match of a success: it stands, and its settled front silhouette has this IoU with the target.
+        progress: Called with the number of scenes done.
 
     Raises:
         StackgenError: If no sample failed.
@@ -130,15 +118,18 @@ def prefer(
         part = order[start : start + _SCENES_AT_ONCE]
         targets = stacks.images(part)
         samples = sampler.sample_batch(targets, stacks.counts[part], num_samples, seed * 1_000_003 + start)
-        verdicts = iter(check_all(checker, [stack for drawn in samples for stack in drawn]))
+        verdicts = iter(checker.check_all([stack for drawn in samples for stack in drawn]))
         for row, target, drawn in zip(part.tolist(), targets, samples, strict=True):
-            good = [_succeeds(next(verdicts), target, iou, grid) for _ in drawn]
-            winners = [stack.poses for stack, ok in zip(drawn, good, strict=True) if ok]
-            for stack in (stack for stack, ok in zip(drawn, good, strict=True) if not ok):
-                own = bool(winners) and rng.random() < 0.5
+            successes, failures = [], []
+            for stack in drawn:
+                verdict = next(verdicts)
+                good = verdict.stable and silhouette_iou(verdict.settled, target, sampler.world.grid) >= iou
+                (successes if good else failures).append(stack.poses)
+            for poses in failures:
+                own = bool(successes) and rng.random() < 0.5
                 rows.append(row)
-                better.append(winners[rng.integers(len(winners))] if own else _truth(stacks, row))
-                worse.append(stack.poses)
+                better.append(successes[rng.integers(len(successes))] if own else _truth(stacks, row))
+                worse.append(poses)
         progress(min(start + _SCENES_AT_ONCE, len(order)))
     if not rows:
         raise StackgenError("prefer: every sample stands and matches, so there is nothing to learn from them")
@@ -151,10 +142,6 @@ def prefer(
     return Preferences(*pair)
 
 
-def _succeeds(verdict: Verdict, target: NDArray[np.bool_], iou: float, grid: Grid) -> bool:
-    return verdict.stable and silhouette_iou(verdict.settled, target, grid=grid) >= iou
-
-
 def _truth(stacks: StackArrays, row: int) -> NDArray[np.float64]:
     """(k, 6) poses of a stack, its blocks sorted by shape."""
     length = stacks.lengths[row]
@@ -163,6 +150,7 @@ def _truth(stacks: StackArrays, row: int) -> NDArray[np.float64]:
 
 
 def _padded(poses: list[NDArray[np.float64]], shapes: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(P, N, 6) poses, zero after the last block of each stack."""
     out = np.zeros((*shapes.shape, 6), np.float32)
     for row, found in zip(out, poses, strict=True):
         row[: len(found)] = found

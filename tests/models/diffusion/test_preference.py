@@ -11,17 +11,17 @@ import torch
 from numpy.typing import NDArray
 
 from stackgen._lightning import pl
+from stackgen.data.arrays import StackArrays
 from stackgen.data.datamodule import StackDataModule
-from stackgen.data.loading.arrays import StackArrays
 from stackgen.data.preferences import Preferences, prefer
 from stackgen.errors import StackgenError
 from stackgen.models.diffusion.network import DiffusionSampler
 from stackgen.models.diffusion.preference import VerdictTuning
 from stackgen.models.optimization import OptimizerConfig
-from stackgen.protocols import Verdict
+from stackgen.protocols import StabilityChecker, Verdict
 from stackgen.sampling.methods import load_sampler
 from stackgen.stack import Stack
-from stackgen.world import Mask
+from stackgen.world import PAPER_WORLD, Mask
 from tests.conftest import Cli, TinyWeights
 from tests.models.conftest import TINY_CROSS, trainer_for
 
@@ -30,6 +30,8 @@ pytestmark = pytest.mark.filterwarnings("ignore")
 
 class EveryThirdFails:
     """Knows the truth of each scene, and gives it; every third sample comes one cell too high."""
+
+    world, settings, card = PAPER_WORLD, {}, {}
 
     def __init__(self, stacks: StackArrays) -> None:
         self.truths = {stacks.images([i]).tobytes(): i for i in range(len(stacks))}
@@ -49,7 +51,7 @@ class EveryThirdFails:
         return Stack(self.stacks.shapes[row, order], self.stacks.poses[row, order] + lifted)
 
 
-class OnTheGround:
+class OnTheGround(StabilityChecker):
     """Stable is what touches the ground."""
 
     def check(self, stack: Stack) -> Verdict:
