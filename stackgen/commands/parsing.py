@@ -15,6 +15,7 @@ from jsonargparse.typing import register_type
 from omegaconf.errors import OmegaConfBaseException
 
 from stackgen.commands.hints import did_you_mean
+from stackgen.commands.old_names import renew
 from stackgen.errors import StackgenError
 from stackgen.world import Catalogue
 
@@ -166,14 +167,15 @@ def parse(parser: ArgumentParser, verb: str, argv: Sequence[str], own: ArgumentP
 def own_sections(verb: str, argv: Sequence[str]) -> list[str]:
     """Replace each `--config FILE` that has a section named like the verb by the text of that section.
 
-    So one file can hold the options of several verbs that belong together.
+    So one file can hold the options of several verbs that belong together. Names that classes had before are
+    replaced by those they have now.
     """
-    arguments = list(argv)
+    arguments = [renew(argument) for argument in argv]
     for index, value in option_values(arguments, CONFIG_FLAGS):
-        section = _section(Path(value), verb)
-        if section is not None:
+        text = _own_text(Path(value), verb)
+        if text is not None:
             flag, equals, _ = arguments[index].partition("=")
-            arguments[index] = f"{flag}={section}" if equals and flag in CONFIG_FLAGS else section
+            arguments[index] = f"{flag}={text}" if equals and flag in CONFIG_FLAGS else text
     return arguments
 
 
@@ -193,14 +195,16 @@ def option_values(arguments: Sequence[str], flags: Sequence[str]) -> list[tuple[
     return found
 
 
-def _section(file: Path, verb: str) -> str | None:
+def _own_text(file: Path, verb: str) -> str | None:
+    """What is to stand in the place of a configuration file; None for the file as it is."""
     try:
-        content = yaml.safe_load(file.read_text()) if file.is_file() else None
+        written = file.read_text() if file.is_file() else ""
+        content = yaml.safe_load(text := renew(written))
     except (yaml.YAMLError, UnicodeDecodeError):
         return None  # the parser will say so
     if isinstance(content, dict) and isinstance(content.get(verb), dict):
         return yaml.safe_dump(content[verb], sort_keys=False)
-    return None
+    return text if text != written else None
 
 
 _NOISE = re.compile(
