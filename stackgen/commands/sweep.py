@@ -10,21 +10,21 @@ from rich.console import Console
 
 from stackgen.commands.parsing import Command
 from stackgen.commands.progress_bar import progress_bar
-from stackgen.errors import StackgenError
+from stackgen.errors import StackgenError, require
 from stackgen.training.runs import RUNS
 from stackgen.training.sweeps.file import Sweep
 
 
 def main(sweep: Sweep, out: Path | None = None, parallel: int = 1, seed: int = 0, export_wandb: bool = False) -> None:
-    """Try many settings of a program: a W&B sweep file, run here by Optuna with no account.
+    """Try many settings of a program, as a W&B sweep file says; Optuna runs it here, without an account.
 
-    Stopped or killed, it goes on with the same command.
+    A sweep that was stopped or killed continues with the same command.
 
     Args:
-        sweep: What to try.
+        sweep: The sweep file.
         out: Folder of the sweep; runs/sweeps/NAME by default.
-        parallel: Trials at once, each with its share of the processor's cores.
-        seed: Of the proposals.
+        parallel: Number of trials at once; they share the processor's cores.
+        seed: Seed of the proposals.
         export_wandb: Whether to print the file for `wandb sweep` instead.
     """
     if export_wandb:
@@ -32,15 +32,16 @@ def main(sweep: Sweep, out: Path | None = None, parallel: int = 1, seed: int = 0
         return
     if parallel < 1:
         raise StackgenError(f"--parallel must be at least 1, got {parallel}")
+    require("optuna", "sweeps")
     from stackgen.training.sweeps.coordinator import JOURNAL, run_sweep, trials_wanted
     from stackgen.training.sweeps.findings import leaderboard_table, ranking, write_findings
 
     folder = out or RUNS / "sweeps" / sweep.name
     with progress_bar(sweep.name, trials_wanted(sweep)) as (advance, tell):
         try:
-            study = run_sweep(sweep, folder, parallel, seed, tell, advance)
+            study = run_sweep(sweep, folder, parallel=parallel, seed=seed, tell=tell, advance=advance)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt("go on with the same command") from None
+            raise KeyboardInterrupt("the same command continues the sweep") from None
     written = write_findings(study, sweep, folder)
     Console().print(leaderboard_table(ranking(study), sweep))
     print(*(f"wrote {path}" for path in written), sep="\n")

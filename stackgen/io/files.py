@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import secrets
 from pathlib import Path
+from typing import Any
 
 from stackgen.errors import StackgenError
 
@@ -32,6 +34,15 @@ def write_atomically(path: str | Path, data: bytes) -> None:
             raise
     except OSError as error:
         raise StackgenError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def write_json(path: str | Path, content: Any, indent: int | None = 1) -> None:
+    """Write a JSON file, whole or not at all.
+
+    Raises:
+        StackgenError: If it cannot be written; `path` is then as it was before.
+    """
+    write_atomically(path, (json.dumps(content, indent=indent, allow_nan=False) + "\n").encode())
 
 
 def require_folder(folder: Path, asked: str) -> None:

@@ -1,7 +1,9 @@
-"""Which code made a file."""
+"""Which code made a file, and on which machine."""
 
 from __future__ import annotations
 
+import os
+import platform
 import subprocess
 from importlib.metadata import version
 from pathlib import Path
@@ -20,3 +22,16 @@ def code_version() -> str:
     except (OSError, subprocess.SubprocessError):
         return package
     return f"{package} {commit}"
+
+
+def cores() -> int:
+    """Number of processor cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def machine() -> str:
+    """Name the processor and its cores, which measured times depend on."""
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return f"{cores()} cores of {names[0] if names else platform.processor() or platform.machine()}"

@@ -1,21 +1,20 @@
-"""One trial: the program of the sweep in a process of its own, that never outlives its coordinator."""
+"""One trial: the sweep's program in a process of its own that never outlives its coordinator."""
 
 from __future__ import annotations
 
 import ctypes
-import json
 import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from stackgen.errors import StackgenError
+from stackgen.io.files import write_json
 from stackgen.training.sweeps.file import DEFAULT_COMMAND, Sweep
-from stackgen.training.sweeps.telling import METRICS_FILE, MetricsReader
+from stackgen.training.sweeps.telling import METRICS_FILE, values_told
 
 PATIENCE = 10.0
 """A child that is told to end is killed after this long [s]."""
@@ -27,17 +26,17 @@ _libc = ctypes.CDLL(None) if sys.platform == "linux" else None
 
 
 def command_of(sweep: Sweep, values: Mapping[str, Any], folder: Path) -> list[str]:
-    """The command line of a trial, W&B's macros filled in.
+    """Make the command line of a trial, with W&B's macros filled in.
 
     Args:
-        sweep: Whose.
-        values: Of all parameters.
-        folder: Of the trial; a `stackgen fit` is told to leave its files there.
+        sweep: The sweep file.
+        values: Values of all parameters, by name.
+        folder: The trial's folder, where `stackgen fit` is told to leave its files.
 
     Raises:
-        StackgenError: If a macro is not known here.
+        StackgenError: If the command has a macro that is not known here.
     """
-    fillings: dict[str, list[str]] = {
+    macros: dict[str, list[str]] = {
         "${env}": [],  # `/usr/bin/env`, which finds a script's interpreter on Unix
         "${interpreter}": [sys.executable],
         "${program}": [sweep.program],
@@ -46,105 +45,80 @@ def command_of(sweep: Sweep, values: Mapping[str, Any], folder: Path) -> list[st
     }
     words: list[str] = []
     for word in sweep.command or DEFAULT_COMMAND:
-        if "${" in word and word not in fillings:
-            raise StackgenError(f"command: {word} is not one of {', '.join(fillings)}")
-        words += fillings.get(word, [word])
+        if "${" in word and word not in macros:
+            raise StackgenError(f"command: {word} is not one of {', '.join(macros)}")
+        words += macros.get(word, [word])
     if words[0] != "stackgen":
         return words
-    own = [f"--name={RUN}", f"--trainer.default_root_dir={folder}"] if words[1:2] == ["fit"] else []
-    quiet = ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"] if own else []
-    return [sys.executable, "-m", *words, *own, *quiet]
+    command = [sys.executable, "-m", *words]
+    if words[1:2] == ["fit"]:
+        command += [f"--name={RUN}", f"--trainer.default_root_dir={folder}"]
+        command += ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
+    return command
 
 
 def _text(value: Any) -> str:
-    """As W&B writes it, but for null, which it cannot."""
+    """Write a value as W&B does, and null, which W&B cannot write."""
     return "null" if value is None else str(value)
 
 
 class Child:
-    """A trial that runs.
+    """The running process of a trial.
 
     Args:
-        sweep: Whose.
-        values: Of all parameters.
-        folder: Of the trial: made here; `log.txt`, `metrics.jsonl` and `parameters.json` go there.
-        threads: Of its computations; what the environment says goes first.
-        lock: Descriptor of the sweep's lock, which the child holds too: as long as it lives nobody begins anew.
+        sweep: The sweep file.
+        values: Values of all parameters, by name.
+        folder: The trial's folder, made here: `log.txt`, `metrics.jsonl` and `parameters.json` go there.
+        threads: Threads of its computations, where the environment does not say.
+        lock: Descriptor of the sweep's lock; the child holds it too, so that no coordinator starts while it lives.
+
+    Raises:
+        StackgenError: If the program cannot be started.
     """
 
     def __init__(self, sweep: Sweep, values: Mapping[str, Any], folder: Path, threads: int, lock: int) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        metrics = folder / "metrics.jsonl"
-        metrics.unlink(missing_ok=True)  # of a try that was interrupted
-        (folder / "parameters.json").write_text(json.dumps(dict(values), indent=1) + "\n")
-        self.log = folder / "log.txt"
-        self.reader = MetricsReader(metrics, sweep.metric.name)
-        self.reports: list[float] = []
-        environment = {"OMP_NUM_THREADS": str(threads), **os.environ, METRICS_FILE: str(metrics.absolute())}
+        self.log, self._metrics, self._metric = folder / "log.txt", folder / "metrics.jsonl", sweep.metric.name
+        self.told: list[float] = []
+        write_json(folder / "parameters.json", dict(values))
+        self._metrics.unlink(missing_ok=True)  # an interrupted try may have left one
+        environment = {"OMP_NUM_THREADS": str(threads), **os.environ, METRICS_FILE: str(self._metrics.absolute())}
         command = command_of(sweep, values, folder)
         try:
             with self.log.open("wb") as log:
                 self.process = subprocess.Popen(
                     command, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT, env=environment,
-                    start_new_session=True, pass_fds=(lock,), preexec_fn=_die_with_parent(),
+                    start_new_session=True, pass_fds=(lock,), preexec_fn=_die_with_parent,
                 )  # fmt: skip
         except OSError as error:
             raise StackgenError(f"{command[0]} cannot be started: {error.strerror}") from error
 
-    def new_reports(self) -> list[tuple[int, float]]:
-        """Values of the metric since the last call, numbered from the first of all, which is 1."""
-        known = len(self.reports)
-        self.reports += self.reader.new()
-        return list(enumerate(self.reports[known:], known + 1))
-
-    @property
-    def exit_code(self) -> int | None:
-        """None while it runs."""
-        return self.process.poll()
+    def news(self) -> list[tuple[int, float]]:
+        """Values of the metric that were told since the last call, each with its number, from 1."""
+        known = len(self.told)
+        self.told = values_told(self._metrics, self._metric)
+        return list(enumerate(self.told, 1))[known:]
 
     def last_words(self) -> str:
-        """The last line it printed."""
+        """The last line that the program printed."""
         lines = self.log.read_text(errors="replace").strip().splitlines()
         return lines[-1].strip()[:300] if lines else "(it printed nothing)"
 
     def stop(self) -> None:
-        """End it and what it started."""
-        end_group(self.process)
-
-
-def end_group(process: subprocess.Popen[bytes]) -> None:
-    """Ask a process group to end, then make it."""
-    for blow in (signal.SIGTERM, signal.SIGKILL):
-        if process.poll() is None:
+        """Ask the program and what it started to end; kill them if they do not."""
+        for blow in (signal.SIGTERM, signal.SIGKILL):
+            if self.process.poll() is not None:
+                return
             try:
-                os.killpg(process.pid, blow)
+                os.killpg(self.process.pid, blow)
+                self.process.wait(PATIENCE)
             except ProcessLookupError:
                 break
-            until = time.monotonic() + PATIENCE
-            while process.poll() is None and time.monotonic() < until:
-                time.sleep(0.02)
-    process.wait()
+            except subprocess.TimeoutExpired:
+                continue
+        self.process.wait()
 
 
-def _die_with_parent() -> Callable[[], None] | None:
-    """On Linux: what a new process does so that it is killed when the coordinator is, however that happens."""
-    if _libc is None:
-        return None
-    libc: ctypes.CDLL = _libc
-
-    def ask_kernel() -> None:
-        libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-
-    return ask_kernel
-
-
-def threads_each(parallel: int, environment: Mapping[str, str] = os.environ, cores: int | None = None) -> int:
-    """Threads for each of some children.
-
-    >>> threads_each(3, {}, 8), threads_each(4, {}, 2), threads_each(1, {"OMP_NUM_THREADS": "5"}, 8)
-    (2, 1, 5)
-    """
-    if environment.get("OMP_NUM_THREADS", "").isdigit():
-        return int(environment["OMP_NUM_THREADS"])
-    there: Sequence[int] | range = range(cores) if cores else sorted(os.sched_getaffinity(0))
-    return max(1, len(there) // parallel)
+def _die_with_parent() -> None:
+    """Ask Linux to kill this new process when its coordinator dies, however that happens."""
+    if _libc is not None:
+        _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -1,17 +1,19 @@
 """The one process of a sweep that asks Optuna for trials and tells it how they went.
 
-All it knows lies in the journal: killed at any moment, it goes on with the same command, begins the trials
-that were running again, with the values they had, and ends with exactly as many trials as were asked for.
+All it knows lies in Optuna's journal. If it is killed at any moment, the same command continues the sweep: trials that
+were running start again with the values they had, and there are exactly as many trials as were asked for.
+
+Optuna's own heartbeat and retries are for SQL databases and for several workers. There, a trial that was interrupted
+counts as failed and another one takes its place, and of two workers each may start the last one.
 """
 
 from __future__ import annotations
 
 import fcntl
-import itertools
 import math
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,77 +21,74 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from stackgen.errors import StackgenError
+from stackgen.errors import StackgenError, require
 from stackgen.io.files import write_atomically
-from stackgen.training.sweeps.child import Child, threads_each
+from stackgen.io.provenance import cores
+from stackgen.training.sweeps.child import Child
 from stackgen.training.sweeps.file import Sweep
-from stackgen.training.sweeps.space import constants_of, grid_of, space_of, suggest
+from stackgen.training.sweeps.space import constants_of, grid_of, grid_point, space_of
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
     from optuna.distributions import BaseDistribution
     from optuna.pruners import BasePruner
     from optuna.samplers import BaseSampler
+    from optuna.trial import FrozenTrial
 
 JOURNAL, SWEEP_FILE, LOCK = "journal.log", "sweep.yaml", "lock"
 DEFAULT_TRIALS = 30
 FAILURES = 3
-"""So many trials that fail in a row, and the sweep ends: the mistake is in what they share."""
+"""The sweep ends when so many trials in a row fail: the mistake is in what they share."""
 _POLL = 0.1  # [s]
-
-Tell = Callable[[str], None]
 
 
 def run_sweep(
     sweep: Sweep,
     folder: Path,
+    *,
     parallel: int = 1,
     seed: int = 0,
-    tell: Tell = print,
+    tell: Callable[[str], None] = print,
     advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> Study:
-    """Run what is left of a sweep.
+    """Run the trials of a sweep that are left to run.
 
     Args:
-        sweep: What to try.
-        folder: Where it lives; another sweep's is refused.
-        parallel: Trials at once.
-        seed: Of the proposals; with one trial at once the same seed makes the same proposals.
-        tell: Told a line when a trial ends.
-        advance: Told (trials done, trials in all).
+        sweep: The sweep file.
+        folder: The sweep's folder; the folder of another sweep is refused.
+        parallel: Number of trials at once.
+        seed: Seed of the proposals; with one trial at once the same seed makes the same proposals.
+        tell: Function that is given a line when a trial ends.
+        advance: Function that is given (trials that have ended, trials in all).
 
     Raises:
-        StackgenError: If another coordinator is at work there, or trial after trial fails.
+        StackgenError: If another coordinator is at work in the folder, or trial after trial fails.
     """
     space, constants = space_of(sweep.parameters), constants_of(sweep.parameters)
+    threads = max(1, cores() // parallel)
     with folder_lock(folder) as lock:
         remember(sweep, folder)
         study = open_study(sweep, folder, seed, parallel)
-        wanted = trials_wanted(sweep)
-        waiting = unfinished(study)
-        if waiting:
-            tell(f"going on: {len(waiting)} trials were interrupted and begin again")
+        if interrupted := requeue(study):
+            tell(f"{interrupted} trials were interrupted and start again")
         running: dict[int, tuple[Trial, Child]] = {}
         failures = 0
         try:
             while True:
-                total = len(study.get_trials(deepcopy=False))
-                while len(running) < parallel and (waiting or total < wanted):
-                    trial = waiting.pop(0) if waiting else study.ask()
-                    total = max(total, trial.number + 1)
-                    values = {**constants, **_values(study, trial, sweep, space)}
+                while len(running) < parallel and (trial := next_trial(study, sweep, space)):
                     place = folder / "trials" / f"{trial.number:04d}"
-                    running[trial.number] = trial, Child(sweep, values, place, threads_each(parallel), lock)
-                advance(total - len(running) - len(waiting), wanted)
+                    child = Child(sweep, {**constants, **trial.params}, place, threads, lock)
+                    running[trial.number] = trial, child
+                advance(sum(trial.state.is_finished() for trial in trials_of(study)), trials_wanted(sweep))
                 if not running:
                     return study
                 time.sleep(_POLL)
                 for number, (trial, child) in list(running.items()):
-                    line = follow(study, trial, child, sweep)
-                    if line is not None:
+                    ended = follow(study, trial, child, sweep)
+                    if ended is not None:
                         del running[number]
-                        failures = failures + 1 if line.startswith(f"trial {number}: failed") else 0
-                        tell(line)
+                        tell(line := line_of(ended, sweep))
+                        failures = failures + 1 if ended.state.name == "FAIL" else 0
                         if failures == FAILURES:
                             raise StackgenError(f"{FAILURES} trials in a row failed; {line}; see {child.log}")
         finally:
@@ -97,87 +96,98 @@ def run_sweep(
                 child.stop()
 
 
-def follow(study: Study, trial: Trial, child: Child, sweep: Sweep) -> str | None:
-    """Hear what a trial has to say, give it up if it is no good; a line when it has ended, else None."""
+def next_trial(study: Study, sweep: Sweep, space: Mapping[str, BaseDistribution]) -> Trial | None:
+    """Start the next trial, an interrupted one first; None if the sweep has all its trials."""
+    trials = trials_of(study)
+    if not any(trial.state.name == "WAITING" for trial in trials):
+        if len(trials) >= trials_wanted(sweep):
+            return None
+        if sweep.method == "grid":
+            study.enqueue_trial(grid_point(grid_of(space), len(trials)))
+    return study.ask(dict(space))
+
+
+def follow(study: Study, trial: Trial, child: Child, sweep: Sweep) -> FrozenTrial | None:
+    """Hear what a trial has to tell and give it up if it is no good; the trial if it has ended, else None."""
     from optuna.trial import TrialState
 
-    code = child.exit_code  # before the last reports are read
-    known = study.get_trials(deepcopy=False)[trial.number].intermediate_values
+    code = child.process.poll()  # before the last values are read
+    known = trials_of(study)[trial.number].intermediate_values
     stop = sweep.early_terminate
-    for step, value in child.new_reports():
+    for step, value in child.news():
         if step not in known and math.isfinite(value):
             trial.report(value, step)
         whole = stop is not None and stop.max_iter is not None and step >= stop.max_iter
         if code is None and not whole and trial.should_prune():
             child.stop()
-            study.tell(trial, state=TrialState.PRUNED)
-            return f"trial {trial.number}: given up after {step} reports at {value:.4g}"
+            return study.tell(trial, state=TrialState.PRUNED)
     if code is None:
         return None
-    if code == 0 and child.reports and math.isfinite(child.reports[-1]):
-        study.tell(trial, child.reports[-1])
-        return f"trial {trial.number}: {sweep.metric.name} {child.reports[-1]:.4g}"
+    if code == 0 and child.told and math.isfinite(child.told[-1]):
+        return study.tell(trial, child.told[-1])
     why = f"exit code {code}: {child.last_words()}" if code else f"it never told {sweep.metric.name}"
     trial.set_user_attr("failure", why)
-    study.tell(trial, state=TrialState.FAIL)
-    return f"trial {trial.number}: failed: {why}"
+    return study.tell(trial, state=TrialState.FAIL)
 
 
-def _values(study: Study, trial: Trial, sweep: Sweep, space: dict[str, BaseDistribution]) -> dict[str, Any]:
-    """What a trial tries; in a grid the point of its number."""
-    if sweep.method == "grid":
-        from optuna.samplers import PartialFixedSampler, RandomSampler
+def line_of(trial: FrozenTrial, sweep: Sweep) -> str:
+    """Say in a line how a trial ended."""
+    if trial.state.name == "FAIL":
+        return f"trial {trial.number}: failed: {trial.user_attrs['failure']}"
+    if trial.state.name == "PRUNED":
+        return f"trial {trial.number}: given up after {trial.last_step} reports at {trial.value:.4g}"
+    return f"trial {trial.number}: {sweep.metric.name} {trial.value:.4g}"
 
-        grid = grid_of(space)
-        point = next(itertools.islice(itertools.product(*grid.values()), trial.number, None))
-        study.sampler = PartialFixedSampler(dict(zip(grid, point, strict=True)), RandomSampler())
-    return suggest(trial, space)
+
+def trials_of(study: Study) -> list[FrozenTrial]:
+    """All trials in the order of their numbers, not copied."""
+    return study.get_trials(deepcopy=False)
 
 
 def trials_wanted(sweep: Sweep) -> int:
-    """Trials of the whole sweep."""
+    """Number of trials of the whole sweep."""
     if sweep.method != "grid":
         return sweep.run_cap or DEFAULT_TRIALS
     points = math.prod(map(len, grid_of(space_of(sweep.parameters)).values()))
     return min(points, sweep.run_cap or points)
 
 
-def unfinished(study: Study) -> list[Trial]:
-    """The trials that an earlier coordinator began and did not see the end of."""
-    from optuna import Trial
+def requeue(study: Study) -> int:
+    """Let the trials wait that an earlier coordinator started and did not see the end of; how many there are."""
     from optuna.trial import TrialState
 
     left = study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))
-    # The same trial again, not one like it, so that it is counted once; Optuna has no public way to take one up.
-    return [Trial(study, trial._trial_id) for trial in left]
+    for trial in left:
+        # The same trial again, not one like it, so that it counts once. Optuna has no public way.
+        study._storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+    return len(left)
 
 
 def open_study(sweep: Sweep, folder: Path, seed: int = 0, parallel: int = 1) -> Study:
-    """The sweep's trials so far, and who proposes more."""
-    import optuna
-    from optuna.storages import JournalStorage
+    """Open the journal of a sweep: its trials so far, what proposes more of them, and what gives them up."""
+    optuna = require("optuna", "sweeps")
     from optuna.storages.journal import JournalFileBackend
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
     journal = folder / JOURNAL
-    # Who holds the sweep's own lock is alone: what lies there is of a process that was killed.
+    # Optuna waits half a minute for a lock of its own that a killed process left; whoever holds the folder is alone.
     for stale in folder.glob(f"{JOURNAL}.lock*"):
         stale.unlink(missing_ok=True)
     mend_journal(journal)
     study = optuna.create_study(
-        storage=JournalStorage(JournalFileBackend(str(journal))),
+        storage=optuna.storages.JournalStorage(JournalFileBackend(str(journal))),
         study_name=sweep.name,
         direction=sweep.metric.goal,
         pruner=_pruner(sweep),
         load_if_exists=True,
     )
-    study.sampler = _sampler(sweep, seed, len(study.get_trials(deepcopy=False)), parallel)
+    study.sampler = _sampler(sweep, seed, len(trials_of(study)), parallel)
     return study
 
 
 def mend_journal(journal: Path) -> None:
-    """Cut off a last line that a killed process left half-written."""
+    """Cut off a last line that a killed process left half-written: Optuna would glue its next line to it."""
     if journal.exists():
         content = journal.read_bytes()
         whole = content[: content.rfind(b"\n") + 1]
@@ -186,14 +196,14 @@ def mend_journal(journal: Path) -> None:
 
 
 def _sampler(sweep: Sweep, seed: int, known: int, parallel: int) -> BaseSampler:
-    import optuna
+    from optuna.samplers import RandomSampler, TPESampler
 
-    # A coordinator that goes on must not propose again what it proposed first.
+    # A coordinator that continues must not propose what the first one proposed.
     own = int(np.random.SeedSequence([seed, known]).generate_state(1)[0])
     if sweep.method != "bayes":
-        return optuna.samplers.RandomSampler(seed=own)
+        return RandomSampler(seed=own)
     startup = min(10, max(2, trials_wanted(sweep) // 3))
-    return optuna.samplers.TPESampler(seed=own, n_startup_trials=startup, multivariate=True, constant_liar=parallel > 1)
+    return TPESampler(seed=own, n_startup_trials=startup, multivariate=True, constant_liar=parallel > 1)
 
 
 def _pruner(sweep: Sweep) -> BasePruner:
@@ -205,10 +215,10 @@ def _pruner(sweep: Sweep) -> BasePruner:
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[int]:
-    """Hold a sweep's folder; the descriptor, to be handed to children, who hold it with us.
+    """Hold a sweep's folder; yields the descriptor, which children are given so that they hold it too.
 
     Raises:
-        StackgenError: If somebody else does.
+        StackgenError: If another process holds it.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -229,7 +239,7 @@ _MAY_CHANGE = ("run_cap", "description", "project", "entity")
 
 
 def remember(sweep: Sweep, folder: Path) -> None:
-    """Write down which sweep this is; refuse a folder of another.
+    """Write down which sweep this is; refuse the folder of another.
 
     Raises:
         StackgenError: If the folder's sweep differs in more than the number of trials.

@@ -19,11 +19,11 @@ DEFAULT_COMMAND = ("${env}", "${interpreter}", "${program}", "${args}")
 
 @dataclass(frozen=True)
 class Metric:
-    """What a sweep is about.
+    """What a sweep optimises.
 
     Args:
-        name: As the program logs it.
-        goal: Which way is better.
+        name: Name of the metric, as the program logs it.
+        goal: Direction that is better.
     """
 
     name: str
@@ -35,14 +35,14 @@ class EarlyTerminate:
     """When a trial is given up: successive halving, as W&B's `hyperband` is (Li et al. 2018).
 
     At the rungs min_iter, eta * min_iter, eta^2 * min_iter, ... only the best 1 / eta of the trials that came
-    so far go on.
+    so far continue.
 
     Args:
-        type: Of the rule; W&B knows no other.
+        type: Name of the rule; W&B knows no other.
         min_iter: First rung, in reports of the metric.
         max_iter: Reports of a whole trial; with `s` instead of `min_iter`, the first rung is max_iter / eta^s.
-        s: Rungs below `max_iter`.
-        eta: Trials that come to a rung for each one that goes on.
+        s: Number of rungs below `max_iter`.
+        eta: Trials that come to a rung for each one that continues.
     """
 
     type: Literal["hyperband"] = "hyperband"
@@ -66,18 +66,18 @@ class Sweep:
     """A sweep file.
 
     Args:
-        program: What every trial runs.
+        program: Program that every trial runs.
         parameters: What is tried: for each name `value`, `values`, or `min` and `max` with a `distribution`.
         metric: What is optimised.
-        method: `bayes` proposes by what was found so far (locally: TPE), `random` and `grid` do not.
-        command: How the program is called; `${program}`, `${interpreter}`, `${env}`, `${args}` and
+        method: How values are proposed: `bayes` learns from the trials so far (here TPE), `random` and `grid` do not.
+        command: Words of a trial's command line; `${program}`, `${interpreter}`, `${env}`, `${args}` and
             `${args_no_hyphens}` are filled in.
         early_terminate: When a trial is given up; never if left out.
-        run_cap: Trials in all; by default 30, of a grid all.
-        name: Of the sweep; its files go to runs/sweeps/NAME.
-        description: For people.
-        project: At W&B.
-        entity: At W&B.
+        run_cap: Number of trials in all; 30 by default, for a grid all its points.
+        name: Name of the sweep; its files go to runs/sweeps/NAME.
+        description: Words for people.
+        project: Project at W&B.
+        entity: Account at W&B.
     """
 
     program: str
@@ -106,12 +106,12 @@ class Sweep:
         return _without_nulls(asdict(self))
 
     def to_yaml(self) -> str:
-        """For `wandb sweep`."""
+        """The file for `wandb sweep`."""
         return yaml.safe_dump(self.to_json(), sort_keys=False)
 
 
 def _without_nulls(content: Mapping[str, Any]) -> dict[str, Any]:
-    """What was given, at the top and one level below; a parameter's value may be null and stays."""
+    """Keep what was given, at the top and in the two groups; a parameter's value may be null and stays."""
     kept = {name: value for name, value in content.items() if value is not None}
     for name in ("metric", "early_terminate"):
         if name in kept:

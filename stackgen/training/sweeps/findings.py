@@ -1,4 +1,4 @@
-"""What a sweep found, as files: leaderboard, best configuration, importance and slice plots."""
+"""What a sweep found, as files: leaderboard, best configuration, and plots of the parameters and their importance."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,94 +23,77 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from optuna import Study
+    from optuna.distributions import BaseDistribution
+    from optuna.trial import FrozenTrial
 
 BEST, LEADERBOARD, IMPORTANCE, SLICES = "best.yaml", "leaderboard.csv", "importance.png", "slices.png"
-_COLOURS = {"complete": "#3b78b4", "pruned": "#b9bec7", "best": "#c8402f"}
+_COLOURS = {"PRUNED": "#b9bec7", "COMPLETE": "#3b78b4", "best": "#c8402f"}
 _DPI = 130
-_LETTERS = 24  # of a setting that is a text
+_LETTERS = 24
+"""Letters of a setting that is a text, at most."""
 
 
-@dataclass(frozen=True)
-class Row:
-    """A trial as the leaderboard shows it.
-
-    Args:
-        trial: Its number.
-        state: `complete`, `pruned` (given up), `fail` or `running`.
-        value: Of the metric, the last that was told; NaN if none was.
-        reports: How often it told.
-        seconds: From its beginning to its end; NaN while it runs [s].
-        values: Of the parameters.
-    """
-
-    trial: int
-    state: str
-    value: float
-    reports: int
-    seconds: float
-    values: Mapping[str, Any]
+def value_of(trial: FrozenTrial) -> float:
+    """A trial's value of the metric: the last that was told; NaN if none was."""
+    told = trial.intermediate_values
+    return trial.value if trial.value is not None else told[max(told)] if told else math.nan
 
 
-def ranking(study: Study) -> list[Row]:
-    """All trials: those that ran to their end, the best first, then the others."""
-    rows = []
-    for trial in study.get_trials(deepcopy=False):
-        told = trial.intermediate_values
-        last = told[max(told)] if told else math.nan
-        seconds = trial.duration.total_seconds() if trial.duration else math.nan
-        value = last if trial.value is None else trial.value
-        rows.append(Row(trial.number, trial.state.name.lower(), value, len(told), seconds, trial.params))
+def ranking(study: Study) -> list[FrozenTrial]:
+    """Sort all trials: those that ran to their end, the best first, then those given up, then the others."""
     sign = -1 if study.direction.name == "MAXIMIZE" else 1
-    order = {"complete": 0, "pruned": 1}
+    order = {"COMPLETE": 0, "PRUNED": 1}
 
-    def key(row: Row) -> tuple[int, float]:
-        return order.get(row.state, 2), math.inf if math.isnan(row.value) else sign * row.value
+    def key(trial: FrozenTrial) -> tuple[int, float]:
+        value = value_of(trial)
+        return order.get(trial.state.name, 2), math.inf if math.isnan(value) else sign * value
 
-    return sorted(rows, key=key)
+    return sorted(study.get_trials(deepcopy=False), key=key)
 
 
 def write_findings(study: Study, sweep: Sweep, folder: Path) -> list[Path]:
-    """Write everything that a sweep found; answers the files.
+    """Write everything that a sweep found, and list the files.
 
     Raises:
         StackgenError: If no trial ran to its end.
     """
-    rows = ranking(study)
-    done = [row for row in rows if row.state == "complete"]
-    if not done:
+    trials = ranking(study)
+    values = {trial.value for trial in trials if trial.state.name == "COMPLETE"}
+    if not values:
         raise StackgenError(f"no trial of {folder} ran to its end; look into {folder}/trials/*/log.txt")
-    write_atomically(folder / LEADERBOARD, leaderboard(rows, sweep).encode())
-    write_atomically(folder / BEST, best_configuration(done[0], sweep, folder, len(rows)).encode())
-    _save(slice_figure(rows, sweep), folder / SLICES)
+    write_atomically(folder / LEADERBOARD, leaderboard(trials, sweep).encode())
+    write_atomically(folder / BEST, best_configuration(trials[0], sweep, folder, len(trials)).encode())
+    write_slices(trials, sweep, folder / SLICES)
     written = [folder / BEST, folder / LEADERBOARD, folder / SLICES]
-    shares = importances(study)
-    if shares:
-        _save(importance_figure(shares, sweep), folder / IMPORTANCE)
+    if sum(trial.state.name == "COMPLETE" for trial in trials) >= 4 and len(values) > 1:
+        write_importance(study, sweep, folder / IMPORTANCE)
         written.append(folder / IMPORTANCE)
     return written
 
 
-def leaderboard(rows: Sequence[Row], sweep: Sweep) -> str:
+def leaderboard(trials: Sequence[FrozenTrial], sweep: Sweep) -> str:
     """The trials as CSV, the best first."""
     names = list(space_of(sweep.parameters))
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["rank", "trial", "state", sweep.metric.name, "reports", "seconds", *names])
-    for rank, row in enumerate(rows, 1):
-        figures = [f"{row.value:.6g}", row.reports, f"{row.seconds:.1f}"]
-        table.writerow([rank, row.trial, row.state, *figures, *(row.values.get(name) for name in names)])
+    for rank, trial in enumerate(trials, 1):
+        seconds = trial.duration.total_seconds() if trial.duration else math.nan
+        metrics = [f"{value_of(trial):.6g}", len(trial.intermediate_values), f"{seconds:.1f}"]
+        values = [trial.params.get(name) for name in names]
+        table.writerow([rank, trial.number, trial.state.name.lower(), *metrics, *values])
     return text.getvalue()
 
 
-def leaderboard_table(rows: Sequence[Row], sweep: Sweep, most: int = 10) -> Table:
+def leaderboard_table(trials: Sequence[FrozenTrial], sweep: Sweep, most: int = 10) -> Table:
     """The best trials for the terminal."""
     names = list(space_of(sweep.parameters))
     short = [name.rpartition(".")[2] for name in names]
     heads = [s if short.count(s) == 1 else name for s, name in zip(short, names, strict=True)]
     table = Table("trial", "state", sweep.metric.name, *heads, box=None, pad_edge=False)
-    for row in rows[:most]:
-        values = [_shown(row.values.get(name)) for name in names]
-        table.add_row(str(row.trial), row.state, f"{row.value:.4g}", *values)
+    for trial in trials[:most]:
+        values = [_shown(trial.params.get(name)) for name in names]
+        table.add_row(str(trial.number), trial.state.name.lower(), f"{value_of(trial):.4g}", *values)
     return table
 
 
@@ -119,16 +101,16 @@ def _shown(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)[:_LETTERS]
 
 
-def best_configuration(best: Row, sweep: Sweep, folder: Path, trials: int) -> str:
-    """A YAML for `stackgen fit`: the whole configuration of the best trial's run; for other programs its values."""
-    title = f"# The best of {trials} trials of the sweep {sweep.name}: trial {best.trial}, "
+def best_configuration(best: FrozenTrial, sweep: Sweep, folder: Path, trials: int) -> str:
+    """The whole configuration of the best trial's run, for `stackgen fit`; for other programs the trial's values."""
+    title = f"# The best of {trials} trials of the sweep {sweep.name}: trial {best.number}, "
     title += f"{sweep.metric.name} {best.value:.4g}.\n"
     runs = sorted(
-        (folder / "trials" / f"{best.trial:04d}" / RUN).glob("version_*/config.yaml"),
+        (folder / "trials" / f"{best.number:04d}" / RUN).glob("version_*/config.yaml"),
         key=lambda path: path.stat().st_mtime,
     )
     if not runs:
-        return title + yaml.safe_dump(nested({**constants_of(sweep.parameters), **best.values}), sort_keys=False)
+        return title + yaml.safe_dump(nested({**constants_of(sweep.parameters), **best.params}), sort_keys=False)
     config = yaml.safe_load(runs[-1].read_text())
     config["name"] = f"{sweep.name}-best"
     config.pop("ckpt_path", None)
@@ -137,7 +119,7 @@ def best_configuration(best: Row, sweep: Sweep, folder: Path, trials: int) -> st
 
 
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Dotted names as groups.
+    """Turn dotted names into groups.
 
     >>> nested({"a.b": 1, "a.c": 2, "d": 3})
     {'a': {'b': 1, 'c': 2}, 'd': 3}
@@ -152,31 +134,23 @@ def nested(values: Mapping[str, Any]) -> dict[str, Any]:
     return found
 
 
-def importances(study: Study) -> dict[str, float]:
-    """How much of what makes a trial good each parameter is (PED-ANOVA, Watanabe et al. 2023); empty for too few."""
-    from optuna.importance import PedAnovaImportanceEvaluator, get_param_importances
+def write_importance(study: Study, sweep: Sweep, path: Path) -> None:
+    """Plot how much of what makes a trial good each parameter is (PED-ANOVA, Watanabe et al. 2023)."""
+    from matplotlib import pyplot
+    from optuna.visualization.matplotlib import plot_param_importances
 
-    done = [t for t in study.get_trials(deepcopy=False) if t.state.name == "COMPLETE"]
-    if len(done) < 4 or len({t.value for t in done}) < 2:
-        return {}
-    return get_param_importances(study, evaluator=PedAnovaImportanceEvaluator())
-
-
-def importance_figure(shares: Mapping[str, float], sweep: Sweep) -> Figure:
-    """Bars, the most important parameter on top."""
-    from matplotlib.figure import Figure
-
-    names = list(shares)[::-1]
-    figure = Figure((7, 1.2 + 0.4 * len(names)), layout="constrained")
-    axes = figure.add_subplot()
-    axes.barh(names, [shares[name] for name in names], color=_COLOURS["complete"])
-    axes.set(xlabel=f"share of the importance for {sweep.metric.name} (PED-ANOVA)", title=sweep.name)
-    axes.spines[["top", "right"]].set_visible(False)
-    return figure
+    pyplot.switch_backend("agg")  # no window, no display
+    with pyplot.style.context("default"):  # Optuna sets a style for good
+        plot_param_importances(study, target_name=sweep.metric.name).set(title=sweep.name)
+        _save(pyplot.gcf(), path)
+        pyplot.close()
 
 
-def slice_figure(rows: Sequence[Row], sweep: Sweep) -> Figure:
-    """The metric over each parameter, a point a trial."""
+def write_slices(trials: Sequence[FrozenTrial], sweep: Sweep, path: Path) -> None:
+    """Plot the metric over each parameter, a point a trial.
+
+    Optuna's own plot leaves out the trials that were given up, and its names overlap from five parameters on.
+    """
     from matplotlib.figure import Figure
 
     space = space_of(sweep.parameters)
@@ -186,38 +160,32 @@ def slice_figure(rows: Sequence[Row], sweep: Sweep) -> Figure:
     figure.suptitle(f"{sweep.name}: blue ran to the end, grey was given up, red is best")
     for place, (name, distribution) in enumerate(space.items()):
         axes = figure.add_subplot(lines, columns, place + 1)
-        choices = getattr(distribution, "choices", None)
-        _draw_slice(axes, rows, name, choices)
-        if getattr(distribution, "log", False):
-            _logarithmic(axes)
+        _draw_slice(axes, trials, name, distribution)
         axes.set(xlabel=name, ylabel=sweep.metric.name if place % columns == 0 else "")
-    return figure
+    _save(figure, path)
 
 
-def _logarithmic(axes: Axes) -> None:
-    """A logarithmic x axis with numbers at 1, 2 and 5 times powers of ten."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
-
-    axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
-    axes.xaxis.set_minor_locator(NullLocator())
-
-
-def _draw_slice(axes: Axes, rows: Sequence[Row], name: str, choices: Sequence[Any] | None) -> None:
-    told = [row for row in rows if name in row.values and not math.isnan(row.value)]
-    for kind in ("pruned", "complete", "best"):
-        shown = [row for row in told if row.state == kind] if kind != "best" else told[:1]
-        at = [choices.index(row.values[name]) if choices else row.values[name] for row in shown]
-        axes.scatter(at, [row.value for row in shown], s=26, color=_COLOURS[kind], zorder=3 if kind == "best" else 2)
+def _draw_slice(axes: Axes, trials: Sequence[FrozenTrial], name: str, distribution: BaseDistribution) -> None:
+    choices = getattr(distribution, "choices", None)
+    for kind, colour in _COLOURS.items():
+        shown = trials[:1] if kind == "best" else [trial for trial in trials if trial.state.name == kind]
+        at = [choices.index(trial.params[name]) if choices else trial.params[name] for trial in shown]
+        axes.scatter(at, [value_of(trial) for trial in shown], s=26, color=colour, zorder=2)
     if choices:
         axes.set_xticks(range(len(choices)), [str(choice)[:_LETTERS] for choice in choices])
         axes.set_xlim(-0.5, len(choices) - 0.5)
+    elif getattr(distribution, "log", False):
+        from matplotlib.ticker import LogLocator, NullLocator
+
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_locator(NullLocator())
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", alpha=0.3)
 
 
 def _save(figure: Figure, path: Path) -> None:
     data = io.BytesIO()
-    figure.savefig(data, format="png", dpi=_DPI, metadata={"Software": None})  # no version in the file
+    figure.savefig(data, format="png", dpi=_DPI, bbox_inches="tight", metadata={"Software": None})  # no version in it
     write_atomically(path, data.getvalue())

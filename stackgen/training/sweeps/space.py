@@ -2,34 +2,36 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from stackgen.errors import StackgenError
+from stackgen.errors import StackgenError, require
 
 if TYPE_CHECKING:
-    from optuna import Trial
     from optuna.distributions import BaseDistribution
 
-Entry = Mapping[str, Any]
+Parameter = Mapping[str, Any]
+"""How a sweep file describes one parameter."""
 KEYS = {"value", "values", "distribution", "min", "max", "q", "parameters"}
+KINDS = ("uniform", "int_uniform", "q_uniform", "log_uniform", "log_uniform_values", "q_log_uniform_values")
 
 
-def constants_of(parameters: Mapping[str, Entry]) -> dict[str, Any]:
-    """The parameters with one value.
+def constants_of(parameters: Mapping[str, Parameter]) -> dict[str, Any]:
+    """Find the parameters that have one value.
 
     >>> constants_of({"a": {"value": 1}, "b": {"parameters": {"c": {"value": None}, "d": {"values": [1, 2]}}}})
     {'a': 1, 'b.c': None}
     """
-    return {name: entry["value"] for name, entry in _flat(parameters).items() if "value" in entry}
+    return {name: given["value"] for name, given in _flat(parameters).items() if "value" in given}
 
 
-def space_of(parameters: Mapping[str, Entry]) -> dict[str, BaseDistribution]:
-    """The parameters with several.
+def space_of(parameters: Mapping[str, Parameter]) -> dict[str, BaseDistribution]:
+    """Find the parameters that have several values, and their distributions.
 
     Raises:
-        StackgenError: If one is not understood.
+        StackgenError: If a parameter is not understood.
 
     >>> space_of({"rate": {"distribution": "log_uniform_values", "min": 1e-4, "max": 1e-2}})
     {'rate': FloatDistribution(high=0.01, log=True, low=0.0001, step=None)}
@@ -37,10 +39,10 @@ def space_of(parameters: Mapping[str, Entry]) -> dict[str, BaseDistribution]:
     IntDistribution(high=4, log=False, low=1, step=1)
     """
     found = {}
-    for name, entry in _flat(parameters).items():
-        if "value" not in entry:
+    for name, given in _flat(parameters).items():
+        if "value" not in given:
             try:
-                found[name] = _distribution(name, entry)
+                found[name] = _distribution(given)
             except (ValueError, TypeError) as error:
                 raise StackgenError(f"parameter {name}: {error}") from error
     if not found:
@@ -48,27 +50,11 @@ def space_of(parameters: Mapping[str, Entry]) -> dict[str, BaseDistribution]:
     return found
 
 
-def suggest(trial: Trial, space: Mapping[str, BaseDistribution]) -> dict[str, Any]:
-    """A trial's values; those that it has already, of an earlier coordinator, stay."""
-    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
-
-    values: dict[str, Any] = {}
-    for name, d in space.items():
-        if isinstance(d, FloatDistribution):
-            values[name] = trial.suggest_float(name, d.low, d.high, step=d.step, log=d.log)
-        elif isinstance(d, IntDistribution):
-            values[name] = trial.suggest_int(name, d.low, d.high, step=d.step, log=d.log)
-        else:
-            assert isinstance(d, CategoricalDistribution)
-            values[name] = trial.suggest_categorical(name, d.choices)
-    return values
-
-
 def grid_of(space: Mapping[str, BaseDistribution]) -> dict[str, list[Any]]:
-    """All values of every parameter.
+    """List all values of every parameter.
 
     Raises:
-        StackgenError: If one has no end of them.
+        StackgenError: If a parameter has no end of them.
     """
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
@@ -85,61 +71,46 @@ def grid_of(space: Mapping[str, BaseDistribution]) -> dict[str, list[Any]]:
     return grid
 
 
-def _flat(parameters: Mapping[str, Entry], prefix: str = "") -> dict[str, Entry]:
-    """Nested parameters under dotted names."""
-    found: dict[str, Entry] = {}
-    for name, entry in parameters.items():
-        if not isinstance(entry, Mapping) or set(entry) - KEYS:
-            unknown = sorted(set(entry) - KEYS) if isinstance(entry, Mapping) else entry
+def grid_point(grid: Mapping[str, list[Any]], number: int) -> dict[str, Any]:
+    """Pick a point of a grid by its number; the last parameter changes fastest.
+
+    >>> grid_point({"a": [0, 1], "b": ["x", "y", "z"]}, 4)
+    {'a': 1, 'b': 'y'}
+    """
+    return dict(zip(grid, next(itertools.islice(itertools.product(*grid.values()), number, None)), strict=True))
+
+
+def _flat(parameters: Mapping[str, Parameter], prefix: str = "") -> dict[str, Parameter]:
+    """Put nested parameters under dotted names."""
+    found: dict[str, Parameter] = {}
+    for name, given in parameters.items():
+        if not isinstance(given, Mapping) or set(given) - KEYS:
+            unknown = sorted(set(given) - KEYS) if isinstance(given, Mapping) else given
             raise StackgenError(f"parameter {prefix}{name}: {unknown} is not understood; there are {sorted(KEYS)}")
-        if "parameters" in entry:
-            found |= _flat(entry["parameters"], f"{prefix}{name}.")
+        if "parameters" in given:
+            found |= _flat(given["parameters"], f"{prefix}{name}.")
         else:
-            found[f"{prefix}{name}"] = entry
+            found[f"{prefix}{name}"] = given
     return found
 
 
-def _distribution(name: str, entry: Entry) -> BaseDistribution:
-    if "values" in entry:
-        from optuna.distributions import CategoricalDistribution
-
-        if any(isinstance(value, dict | list) for value in entry["values"]):
-            raise StackgenError(f"parameter {name}: write a group of settings as text, such as '{{kind: cosine}}'")
-        return CategoricalDistribution(entry["values"])
-    if not {"min", "max"} <= set(entry):
-        raise StackgenError(f"parameter {name}: give value, values, or min and max")
-    whole = isinstance(entry["min"], int) and isinstance(entry["max"], int)
-    kind = entry.get("distribution", "int_uniform" if whole else "uniform")
-    if kind not in _KINDS:
-        raise StackgenError(f"parameter {name}: distribution {kind!r} is not one of {', '.join(_KINDS)}")
-    return _KINDS[kind](entry["min"], entry["max"], entry.get("q", 1))
-
-
-def _float(low: float, high: float, **options: Any) -> BaseDistribution:
-    from optuna.distributions import FloatDistribution
-
-    return FloatDistribution(float(low), float(high), **options)
-
-
-def _whole(low: float, high: float, **options: Any) -> BaseDistribution:
-    from optuna.distributions import IntDistribution
-
-    if low != int(low) or high != int(high):
-        raise ValueError(f"min and max must be whole numbers, got {low} and {high}")
-    return IntDistribution(int(low), int(high), **options)
-
-
-def _log_steps(low: float, high: float, q: float) -> BaseDistribution:
-    if q != 1:
-        raise ValueError(f"locally q_log_uniform_values goes by whole numbers: q must be 1, got {q}")
-    return _whole(low, high, log=True)
-
-
-_KINDS: dict[str, Callable[[float, float, float], BaseDistribution]] = {
-    "uniform": lambda low, high, _: _float(low, high),
-    "int_uniform": lambda low, high, _: _whole(low, high),
-    "q_uniform": lambda low, high, q: _float(low, high, step=float(q)),
-    "log_uniform": lambda low, high, _: _float(math.exp(low), math.exp(high), log=True),  # W&B: ends are exponents
-    "log_uniform_values": lambda low, high, _: _float(low, high, log=True),
-    "q_log_uniform_values": _log_steps,
-}
+def _distribution(given: Parameter) -> BaseDistribution:
+    distributions = require("optuna", "sweeps").distributions
+    if "values" in given:
+        if any(isinstance(value, dict | list) for value in given["values"]):
+            raise ValueError("write a group of settings as text, such as '{kind: cosine}'")
+        return distributions.CategoricalDistribution(given["values"])
+    if not {"min", "max"} <= set(given):
+        raise ValueError("give value, values, or min and max")
+    low, high, q = given["min"], given["max"], given.get("q", 1)
+    kind = given.get("distribution", KINDS[isinstance(low, int) and isinstance(high, int)])
+    if kind not in KINDS:
+        raise ValueError(f"distribution {kind!r} is not one of {', '.join(KINDS)}")
+    if kind in ("int_uniform", "q_log_uniform_values"):
+        if low != int(low) or high != int(high) or (kind != "int_uniform" and q != 1):
+            raise ValueError(f"min and max must be whole numbers, and q 1; got {low}, {high} and {q}")
+        return distributions.IntDistribution(int(low), int(high), log=kind != "int_uniform")
+    if kind == "log_uniform":  # W&B: the ends are exponents
+        low, high = math.exp(low), math.exp(high)
+    step = float(q) if kind == "q_uniform" else None
+    return distributions.FloatDistribution(float(low), float(high), log=kind.startswith("log"), step=step)

@@ -1,17 +1,15 @@
-"""How a trial tells its sweep what it finds: it appends lines of JSON to the file that a variable names.
+"""How a trial tells its sweep the metrics it measures: it appends lines of JSON to a file that a variable names.
 
     {"step": 200, "validation/loss": 0.31, "sample/stability": 0.42}
 
-Any program can; `stackgen fit` does, after each validation.
+Any program can do so; `stackgen fit` does after each validation.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 from stackgen._lightning import pl
 
@@ -25,7 +23,7 @@ def in_a_sweep() -> bool:
 
 
 class TellSweep(pl.Callback):
-    """Tells the sweep all metrics after each validation; the command line adds it where there is a sweep."""
+    """Tells the sweep all metrics after each validation; `stackgen fit` adds it to a trial of a sweep."""
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Append a line."""
@@ -37,36 +35,15 @@ class TellSweep(pl.Callback):
             file.write(line + "\n")
 
 
-class MetricsReader:
-    """Reads what a trial tells while it tells it.
-
-    Args:
-        path: Of the file; it need not exist yet.
-        metric: The one to look for.
-    """
-
-    def __init__(self, path: Path, metric: str) -> None:
-        self.path, self.metric = path, metric
-        self._place = 0
-
-    def new(self) -> Iterator[float]:
-        """The metric's values since the last call, of whole lines."""
-        if not self.path.exists():
-            return
-        with self.path.open("rb") as file:
-            file.seek(self._place)
-            content = file.read()
-        whole = content[: content.rfind(b"\n") + 1]
-        self._place += len(whole)
-        for line in whole.splitlines():
-            value = _parsed(line).get(self.metric)
-            if isinstance(value, int | float):
-                yield float(value)
-
-
-def _parsed(line: bytes) -> dict[str, Any]:
-    try:
-        content = json.loads(line)
-    except ValueError:
-        return {}
-    return content if isinstance(content, dict) else {}
+def values_told(path: Path, metric: str) -> list[float]:
+    """Read one metric's values so far, of the lines that are whole and JSON."""
+    found = []
+    content = path.read_bytes() if path.exists() else b""
+    for line in content[: content.rfind(b"\n") + 1].splitlines():
+        try:
+            value = json.loads(line).get(metric)
+        except (ValueError, AttributeError):
+            continue
+        if isinstance(value, int | float):
+            found.append(float(value))
+    return found

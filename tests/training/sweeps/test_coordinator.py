@@ -23,7 +23,7 @@ from stackgen.training.sweeps.coordinator import folder_lock, mend_journal, open
 from stackgen.training.sweeps.file import EarlyTerminate, Metric, Sweep
 from stackgen.training.sweeps.findings import ranking, write_findings
 from stackgen.training.sweeps.space import grid_of, space_of
-from stackgen.training.sweeps.telling import MetricsReader
+from stackgen.training.sweeps.telling import values_told
 from tests.conftest import CHILD, Cli
 
 ROOT = Path(__file__).parents[3]
@@ -67,7 +67,7 @@ def sweep_of(program: Path, **options: Any) -> Sweep:
 
 
 def states(folder: Path, sweep: Sweep) -> list[str]:
-    return [row.state for row in sorted(ranking(open_study(sweep, folder)), key=lambda row: row.trial)]
+    return [trial.state.name.lower() for trial in open_study(sweep, folder).trials]
 
 
 def starts(folder: Path) -> list[int]:
@@ -144,7 +144,7 @@ def test_a_sweep_ends_with_the_best_configuration_and_pictures(
 def test_a_grid_is_visited_once(program: Path, tmp_path: Path) -> None:
     sweep = sweep_of(program, method="grid", parameters={"x": {"values": [0, 1, 2]}, "z": {"min": 4, "max": 5}})
     study = run_sweep(sweep, tmp_path / "out", parallel=3, tell=lambda line: None)
-    assert sorted((row.values["x"], row.values["z"]) for row in ranking(study)) == [
+    assert sorted((trial.params["x"], trial.params["z"]) for trial in study.trials) == [
         (x, z) for x in (0, 1, 2) for z in (4, 5)
     ]
 
@@ -155,13 +155,13 @@ def test_bad_trials_are_given_up_and_their_programs_end(program: Path, tmp_path:
     sweep = sweep_of(program, method="grid", parameters=parameters, early_terminate=stop)
     folder = tmp_path / "out"
     study = run_sweep(sweep, folder, tell=lambda line: None)
-    rows = ranking(study)
-    assert rows[0].values["x"] == 3 and rows[0].state == "complete"
-    given_up = [row for row in rows if row.state == "pruned"]
-    assert given_up and min(row.values["x"] for row in given_up) > 3
-    assert len(given_up) + sum(row.state == "complete" for row in rows) == 6
-    for row in rows:
-        assert (folder / f"trials/{row.trial:04d}/done").exists() == (row.state == "complete")
+    best = ranking(study)[0]
+    assert best.params["x"] == 3 and best.state.name == "COMPLETE"
+    given_up = [trial for trial in study.trials if trial.state.name == "PRUNED"]
+    assert given_up and min(trial.params["x"] for trial in given_up) > 3
+    assert len(given_up) + sum(trial.state.name == "COMPLETE" for trial in study.trials) == 6
+    for trial in study.trials:
+        assert (folder / f"trials/{trial.number:04d}/done").exists() == (trial.state.name == "COMPLETE")
 
 
 def test_an_interrupted_sweep_goes_on_with_the_same_trials(program: Path, tmp_path: Path) -> None:
@@ -177,12 +177,12 @@ def test_an_interrupted_sweep_goes_on_with_the_same_trials(program: Path, tmp_pa
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_sweep(sweep, folder, 2, tell=interrupt)
+        run_sweep(sweep, folder, parallel=2, tell=interrupt)
     before = {trial.number: trial.params for trial in open_study(sweep, folder).trials}
     assert states(folder, sweep).count("complete") == 1 and states(folder, sweep).count("running") >= 1
-    study = run_sweep(sweep, folder, 2, tell=lines.append)
+    study = run_sweep(sweep, folder, parallel=2, tell=lines.append)
     assert states(folder, sweep) == ["complete"] * 5
-    assert "were interrupted and begin again" in lines[1]
+    assert "were interrupted and start again" in lines[1]
     assert {n: study.trials[n].params for n in before} == before
     assert sum(starts(folder)) <= 5 + 2
 
@@ -214,13 +214,13 @@ def test_a_journal_that_was_cut_off_is_mended(program: Path, tmp_path: Path) -> 
 
 
 def test_only_whole_lines_are_heard(tmp_path: Path) -> None:
-    reader = MetricsReader(tmp_path / "told", "loss")
-    assert list(reader.new()) == []
-    (tmp_path / "told").write_text('{"loss": 2}\nnoise\n{"other": 1}\n{"lo')
-    assert list(reader.new()) == [2]
-    with (tmp_path / "told").open("a") as file:
+    told = tmp_path / "told"
+    assert values_told(told, "loss") == []
+    told.write_text('{"loss": 2}\nnoise\n[1]\n{"other": 1}\n{"lo')
+    assert values_told(told, "loss") == [2]
+    with told.open("a") as file:
         file.write('ss": 1}\n')
-    assert list(reader.new()) == [1]
+    assert values_told(told, "loss") == [2, 1]
 
 
 def test_the_macros_of_wandb_are_filled_in(program: Path, tmp_path: Path) -> None:
@@ -278,7 +278,7 @@ def test_a_killed_coordinator_leaves_nobody_behind_and_goes_on_with_exactly_its_
         pids = [int(pid) for path in folder.glob("trials/*/starts") for pid in path.read_text().split()]
         time.sleep(0.3)
         assert not [pid for pid in pids if alive(pid)]
-    study = run_sweep(sweep, folder, 2, tell=lambda line: None)
+    study = run_sweep(sweep, folder, parallel=2, tell=lambda line: None)
     assert states(folder, sweep) == ["complete"] * 9
     assert [json.loads(path.read_text())["x"] for path in sorted(folder.glob("trials/*/parameters.json"))] == [
         trial.params["x"] for trial in study.trials
@@ -302,11 +302,11 @@ def test_a_sweep_of_fit_finds_a_configuration_that_fits(
     monkeypatch.setenv("WANDB_MODE", "disabled")
     base = {
         "model": {
-            "class_path": "stackgen.models.diffusion.module.DDPM",
+            "class_path": "stackgen.models.DDPM",
             "init_args": {"denoiser": {"width": 32, "layers": 1, "heads": 2, "feedforward": 64}},
         },
         "data": {"path": str(towers_dataset), "batch_size": 16},
-        "trainer": {"max_epochs": 1, "callbacks": {"class_path": "stackgen.training.callbacks.EMA"}},
+        "trainer": {"max_epochs": 1, "callbacks": {"class_path": "stackgen.training.EMA"}},
     }
     Path("base.yaml").write_text(yaml.safe_dump(base))
     rate = "model.optimizer.learning_rate"
