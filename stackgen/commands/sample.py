@@ -22,10 +22,10 @@ from stackgen.errors import StackgenError
 from stackgen.io.files import require_folder
 from stackgen.io.stacks_file import StacksFile, write_stacks
 from stackgen.models.diffusion.settings import SamplerConfig
-from stackgen.protocols import Judge
+from stackgen.protocols import CheckerName
 from stackgen.stack import format_block_list
 from stackgen.viz.export import write_glb
-from stackgen.viz.render import contact_sheet, save_image
+from stackgen.viz.render import Picture, contact_sheet, overview, save_image
 
 if TYPE_CHECKING:
     from stackgen.sampling.verified import Budget
@@ -41,24 +41,26 @@ def main(
     weights: str = DEFAULT,
     block_list_weights: str = DEFAULT,
     sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
-    verify: Judge | None = None,
+    verify: CheckerName | None = None,
     budget: str | None = None,
 ) -> int:
-    """Turn silhouettes into stacks of blocks, and let a simulator judge each; with --verify exit code 1 if any falls.
+    """Turn silhouettes into stacks of blocks and simulate each; with --verify the exit code is 1 if any falls.
 
     Args:
         images: Pictures of structures.
-        out: Folder for stacks.json, stacks.png and a GLB for each stack; with several images, a folder in it for each.
-        num_samples: Stacks for each image.
-        blocks: Block list, such as cube=3,rectangle=2; chosen by the network by default.
-        inventory: The blocks there are, such as cube=4,rectangle=3; the block list is chosen from them.
-        seed: Same seed, same stacks, unless --budget is a time.
-        weights: Of the sampler: a name, a .safetensors, a .ckpt or the folder of a run.
-        block_list_weights: Of the block-list network, likewise.
-        sampler: How a diffusion model samples; what is null is as its weights have it.
-        verify: Draw many stacks, have them judged by the simulator (the default after --verify alone) or by
-            statics, keep the best; with another block list if nothing stands and none was given.
-        budget: What --verify may spend on an image, a time such as 1s or a number of draws for each block list
+        out: Folder for stacks.json, stacks.png and a GLB for each stack; several images get a folder
+            each in it, beside overview.png.
+        num_samples: Number of stacks for each image.
+        blocks: Block list, such as cube=3,rectangle=2; the network chooses one by default.
+        inventory: Blocks that are available, such as cube=4,rectangle=3; the block list is chosen among them.
+        seed: Seed of the samples: the same seed gives the same stacks, unless --budget is a time.
+        weights: Weights of the sampler: a name, a .safetensors file, a .ckpt file or a run folder.
+        block_list_weights: Weights of the block-list network: a name, a .safetensors file, a .ckpt file or a run
+            folder.
+        sampler: Settings by which a diffusion model samples; the weights' own where one is null.
+        verify: Verified sampling: many stacks are drawn and checked by the simulator (the default after --verify
+            alone) or by statics, and the best are kept; where nothing stands, the next likely block list is tried.
+        budget: Limit of --verify for each image: a time, such as 1s, or a number of draws for each block list,
             such as 64 (the default).
     """
     if num_samples < 1:
@@ -76,6 +78,7 @@ def main(
     if verify:
         draw = partial(model.sample_verified, **asked, verify=verify, budget=spent)
     results: list[StacksFile] = []
+    sheets: list[Picture] = []
     screen = Console(stderr=True)
     with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
         task = progress.add_task("", total=len(images) * (num_samples + 2))
@@ -83,11 +86,13 @@ def main(
             for image, folder in zip(images, folders, strict=True):
                 progress.update(task, description=image.name)
                 result = draw(image, on_step=lambda: progress.advance(task))
-                write_result(result, folder)
+                sheets.append(write_result(result, folder))
                 progress.advance(task)
                 results.append(result)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"{len(results)} of {len(images)} images are finished in {out}") from None
+    if len(images) > 1:
+        save_image(out / "overview.png", overview(sheets))
     return report(results, out, verified=verify is not None)
 
 
@@ -109,11 +114,11 @@ def report(results: Sequence[StacksFile], out: Path, verified: bool) -> int:
     return int(falls)
 
 
-def _budget(verify: Judge | None, budget: str | None) -> Budget | None:
+def _budget(verify: CheckerName | None, budget: str | None) -> Budget | None:
     if budget is None:
         return None
     if verify is None:
-        raise StackgenError("--budget is what --verify may spend: give both, or neither")
+        raise StackgenError("--budget limits --verify: give both, or neither")
     from stackgen.sampling.verified import Budget
 
     return Budget.parse(budget)
@@ -138,19 +143,19 @@ def result_folders(images: Sequence[Path], out: Path) -> list[Path]:
     return [out / name for name in names]
 
 
-def write_result(result: StacksFile, folder: Path) -> None:
-    """Write stacks.json, stacks.png and stack-N.glb; all of them appear, or none."""
+def write_result(result: StacksFile, folder: Path) -> Picture:
+    """Write stacks.json, stacks.png and stack-N.glb, all of them or none; return the contact sheet."""
     assert result.block_list is not None
     title = f"{result.silhouette}: {format_block_list(result.block_list, result.catalogue)}"
     verdicts = [entry.verdict for entry in result.entries]
     ious = [entry.front_iou for entry in result.entries]
+    sheet = contact_sheet(result.target, result.stacks, verdicts, ious, title, grid=result.grid)
     with staged(folder) as stage:
         for number, stack in enumerate(result.stacks, 1):
             write_glb(stage / f"stack-{number}.glb", stack, cell_size=result.cell_size)
-        save_image(
-            stage / "stacks.png", contact_sheet(result.target, result.stacks, verdicts, ious, title, result.grid)
-        )
+        save_image(stage / "stacks.png", sheet)
         write_stacks(stage / "stacks.json", result)
+    return sheet
 
 
 @contextmanager
@@ -191,19 +196,19 @@ COMMAND = Command(
 
 def run(verb: str, argv: Sequence[str]) -> int | None:
     """Run the verb."""
-    # A few stacks keep one thread busy; more only wait for each other, and for whoever else uses the machine.
+    # A few stacks keep one thread busy; more threads only wait for each other.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    return COMMAND.run(with_judge(argv))
+    return COMMAND.run(with_checker(argv))
 
 
-def with_judge(argv: Sequence[str]) -> list[str]:
-    """`--verify` without a judge means the simulator.
+def with_checker(argv: Sequence[str]) -> list[str]:
+    """`--verify` alone means the simulator.
 
-    >>> with_judge(["a.png", "--verify", "--budget", "1s"])
+    >>> with_checker(["a.png", "--verify", "--budget", "1s"])
     ['a.png', '--verify', 'simulator', '--budget', '1s']
     """
-    judges, arguments = get_args(Judge), list(argv)
+    checkers, arguments = get_args(CheckerName), list(argv)
     for place in reversed(range(len(arguments))):
-        if arguments[place] == "--verify" and arguments[place + 1 : place + 2] not in [[judge] for judge in judges]:
-            arguments.insert(place + 1, judges[0])
+        if arguments[place] == "--verify" and arguments[place + 1 : place + 2] not in [[name] for name in checkers]:
+            arguments.insert(place + 1, checkers[0])
     return arguments

@@ -254,6 +254,19 @@ def contact_sheet(
     return np.asarray(sheet)
 
 
+def overview(sheets: Sequence[Picture], across: int = 2) -> Picture:
+    """Put contact sheets (H, W, 3) beside and below each other, at half their size, `across` a row."""
+    import cv2
+
+    small = [cv2.resize(sheet, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for sheet in sheets]
+    height, width = (max(sheet.shape[axis] for sheet in small) for axis in (0, 1))
+    canvas = np.full((math.ceil(len(small) / across) * height, min(across, len(small)) * width, 3), 255, np.uint8)
+    for place, sheet in enumerate(small):
+        y, x = place // across * height, place % across * width
+        canvas[y : y + sheet.shape[0], x : x + sheet.shape[1]] = sheet
+    return canvas
+
+
 def _target_picture(target: Mask) -> Picture:
     """Draw the silhouette dark on light, each pixel a square."""
     from PIL import Image
