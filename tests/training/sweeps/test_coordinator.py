@@ -234,6 +234,17 @@ def test_the_macros_of_wandb_are_filled_in(program: Path, tmp_path: Path) -> Non
         command_of(replace(sweep, command=["${args_json}"]), {}, tmp_path)
 
 
+def test_without_optuna_the_help_and_the_export_work_and_a_sweep_names_the_extra(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    assert "--parallel" in cli("sweep", "--help").out
+    assert cli("sweep", "--config", REAL, "--export_wandb").code == 0
+    answer = cli("sweep", "--config", REAL, "--out", tmp_path / "out")
+    assert answer.code == 2 and "pip install 'stackgen[sweeps]'" in answer.line
+    assert not (tmp_path / "out").exists()
+
+
 def test_what_is_exported_is_the_file(cli: Cli) -> None:
     answer = cli("sweep", "--config", REAL, "--export_wandb")
     assert answer.code == 0, answer.err
