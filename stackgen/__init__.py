@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from stackgen._lazy import lazy
+import lazy_loader
 
 if TYPE_CHECKING:
     from stackgen.api import Model, load, sample
@@ -18,6 +18,6 @@ if TYPE_CHECKING:
 
 __all__ = ["Model", "Stack", "StackgenError", "load", "sample"]
 
-__getattr__, __dir__ = lazy(
-    __name__, {"Stack": "stack", "StackgenError": "errors", **dict.fromkeys(("Model", "load", "sample"), "api")}
+__getattr__, __dir__, _ = lazy_loader.attach(
+    __name__, submod_attrs={"api": ["Model", "load", "sample"], "errors": ["StackgenError"], "stack": ["Stack"]}
 )

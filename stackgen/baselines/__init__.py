@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from stackgen._lazy import lazy
+import lazy_loader
+
 from stackgen.baselines.brute_force import BruteForce
 from stackgen.baselines.greedy_random import GreedyRandom
 from stackgen.baselines.heuristic import Heuristic
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["HEURISTICS", "BruteForce", "GreedyRandom", "RandomPlacement", "TranReg", "TranVAE"]
 
-__getattr__, __dir__ = lazy(__name__, {"TranReg": "modules", "TranVAE": "modules"})
+__getattr__, __dir__, _ = lazy_loader.attach(__name__, submod_attrs={"modules": ["TranReg", "TranVAE"]})
 
 HEURISTICS: dict[str, type[Heuristic]] = {kind.kind: kind for kind in (BruteForce, GreedyRandom, RandomPlacement)}
 """By the name that stands for them where weights are asked for; there they have their default settings."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from stackgen._lazy import lazy
+import lazy_loader
 
 if TYPE_CHECKING:
     from stackgen.data.arrays import to_batch
@@ -23,13 +23,12 @@ if TYPE_CHECKING:
 
 __all__ = ["TESTSET", "Dataset", "StackDataModule", "decode", "to_batch"]
 
-__getattr__, __dir__ = lazy(
+__getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
-    {
-        "TESTSET": "dataset",
-        "Dataset": "dataset",
-        "StackDataModule": "datamodule",
-        "decode": "shards",
-        "to_batch": "arrays",
+    submod_attrs={
+        "arrays": ["to_batch"],
+        "datamodule": ["StackDataModule"],
+        "dataset": ["TESTSET", "Dataset"],
+        "shards": ["decode"],
     },
 )

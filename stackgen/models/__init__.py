@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from stackgen._lazy import lazy
+import lazy_loader
 
 if TYPE_CHECKING:
     from stackgen.models.block_list.module import BlockListCNN
@@ -13,7 +13,11 @@ if TYPE_CHECKING:
 
 __all__ = ["DDPM", "BlockListCNN", "VerdictTuning"]
 
-__getattr__, __dir__ = lazy(
+__getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
-    {"BlockListCNN": "block_list.module", "DDPM": "diffusion.module", "VerdictTuning": "diffusion.preference"},
+    submod_attrs={
+        "block_list.module": ["BlockListCNN"],
+        "diffusion.module": ["DDPM"],
+        "diffusion.preference": ["VerdictTuning"],
+    },
 )

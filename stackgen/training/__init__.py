@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from stackgen._lazy import lazy
+import lazy_loader
 
 if TYPE_CHECKING:
     from stackgen.training.callbacks import EMA, Compile, SampleQuality, StartFrom, Throughput
@@ -12,7 +12,10 @@ if TYPE_CHECKING:
 
 __all__ = ["EMA", "CheckpointArtifact", "Compile", "SampleQuality", "StartFrom", "StepMetrics", "Throughput"]
 
-__getattr__, __dir__ = lazy(
+__getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
-    {name: "plots" if name in ("CheckpointArtifact", "StepMetrics") else "callbacks" for name in __all__},
+    submod_attrs={
+        "callbacks": ["EMA", "Compile", "SampleQuality", "StartFrom", "Throughput"],
+        "plots": ["CheckpointArtifact", "StepMetrics"],
+    },
 )
