@@ -80,6 +80,7 @@ def test_every_package_that_is_imported_is_declared_and_the_other_way_round() ->
         "cv2": "opencv-python-headless",
         "PIL": "pillow",
         "yaml": "pyyaml",
+        "lazy_loader": "lazy-loader",
         "pytorch_lightning": "lightning",
         "ur_analytic_ik": "ur-analytic-ik",
         **dict.fromkeys(("rtde_control", "rtde_io", "rtde_receive"), "ur-rtde"),
