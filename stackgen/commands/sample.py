@@ -24,7 +24,7 @@ from stackgen.io.stacks_file import StacksFile, write_stacks
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.protocols import CheckerName
 from stackgen.stack import format_block_list
-from stackgen.viz.export import write_glb
+from stackgen.viz.gltf import write_glb
 from stackgen.viz.render import Picture, contact_sheet, overview, save_image
 
 if TYPE_CHECKING:

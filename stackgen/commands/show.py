@@ -8,7 +8,7 @@ from pathlib import Path
 
 from stackgen.commands.parsing import Command, Files
 from stackgen.io.stacks_file import read_stacks
-from stackgen.viz.export import write_html
+from stackgen.viz.page import write_html
 from stackgen.viz.render import contact_sheet, save_image
 
 
@@ -26,7 +26,7 @@ def main(file: Path, out: Path | None = None, open: bool = False) -> None:
     verdicts = [entry.verdict for entry in content.entries]
     ious = [entry.front_iou for entry in content.entries]
     title = content.silhouette or file.name
-    save_image(picture, contact_sheet(content.target, content.stacks, verdicts, ious, title, content.grid))
+    save_image(picture, contact_sheet(content.target, content.stacks, verdicts, ious, title, grid=content.grid))
     write_html(page, content.stacks, verdicts, title)
     print(f"wrote {picture}\nwrote {page}")
     if open:

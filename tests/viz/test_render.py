@@ -199,7 +199,7 @@ def test_drawing_needs_no_torch_and_no_matplotlib() -> None:
         "import sys, numpy as np; from stackgen.viz.render import *; from stackgen.stack import Stack;"
         "import stackgen.viz.raster, stackgen.vision.drawings; assert 'cv2' not in sys.modules;"
         "contact_sheet(np.eye(64) > 0, [Stack([0], [[0, 0, 0.5, 0, 0, 0]])], grid=Grid());"
-        "import stackgen.viz.export, stackgen.vision.drawings, stackgen.io.stacks_file;"
+        "import stackgen.viz.gltf, stackgen.viz.page, stackgen.vision.drawings, stackgen.io.stacks_file;"
         "print([m for m in ('torch', 'matplotlib', 'trimesh', 'pybullet', 'jsonschema') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

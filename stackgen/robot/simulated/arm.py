@@ -1,4 +1,4 @@
-"""The UR5 with its jaws in PyBullet, as an arm that a build can use.
+"""The arm with its jaws in PyBullet, as a build uses it.
 
 The blocks are those of the verdicts: same shapes, masses, friction and step (stackgen.sim). The jaws are two
 sliding fingers that a gear constraint keeps symmetric; they hold by friction, or, on request, by a fixed constraint.
@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stackgen.robot.backend import ArmState
+from stackgen.robot.planning.arm_model import arm_model
 from stackgen.robot.planning.clearance import ArmIndices, block_pose, body_placement, load_arm
 from stackgen.robot.planning.motion import Motion
-from stackgen.robot.planning.urdf import BASE, FINGERS, PALM, ur5_chain
-from stackgen.robot.workcell import Cell, Grasp
+from stackgen.robot.planning.urdf import FINGERS, PALM, chain_links
+from stackgen.robot.workcell import Grasp, Workcell
 from stackgen.sim.physics import Physics
 from stackgen.sim.simulator import Mold, bullet, connect
 from stackgen.stack import Stack
-from stackgen.viz.raster import prism_faces
+from stackgen.viz.gltf import prism_mesh
 from stackgen.viz.render import shape_colour
 from stackgen.world import Shape
 
@@ -39,9 +40,9 @@ class PickNoise:
     """How far blocks lie from where the robot believes, as standard deviations of normal distributions.
 
     Args:
-        distance: Along x and along y [m].
-        turn: About z [rad].
-        seed: Same seed, same noise.
+        distance: Distance along x and along y [m].
+        turn: Turn about z [rad].
+        seed: Seed of the noise: the same seed gives the same noise.
     """
 
     distance: float = 0.0
@@ -49,7 +50,7 @@ class PickNoise:
     seed: int = 0
 
     def disturb(self, frames: list[Floats]) -> list[Floats]:
-        """Frames (4, 4), each moved and turned about its own place."""
+        """Move frames (4, 4), and turn each about its own place."""
         random = np.random.default_rng(self.seed)
         moved = []
         for frame in frames:
@@ -62,36 +63,37 @@ class PickNoise:
 
 
 class SimulatedArm:
-    """A cell in PyBullet: arm, jaws, table and blocks.
+    """A workcell in PyBullet: arm, jaws, table and blocks.
 
     Args:
-        cell: Where everything is.
-        stack: Whose blocks there are.
-        frames: (4, 4) of each block at the beginning.
-        physics: Of the blocks; its step is the simulation's.
-        grasp: By friction, or by a fixed constraint.
+        workcell: The arm, its place and its jaws.
+        stack: Stack with the blocks.
+        frames: (4, 4) frame of each block at the beginning.
+        physics: Physics of the blocks; its time step is the simulation's.
+        grasp: How blocks are held: by friction, or by a fixed constraint.
         on_step: Called after every step.
     """
 
     def __init__(
         self,
-        cell: Cell,
+        workcell: Workcell,
         stack: Stack,
         frames: list[Floats],
         physics: Physics,
+        *,
         grasp: Grasp = "jaws",
         on_step: Callable[[], None] = lambda: None,
     ) -> None:
-        self.cell, self.stack, self.grasp, self.on_step = cell, stack, grasp, on_step
+        self.workcell, self.stack, self.grasp, self.on_step = workcell, stack, grasp, on_step
         self.physics = physics
         self.client = connect(physics)
-        self.arm = load_arm(cell, self.client, visual=True)
+        self.arm = load_arm(workcell, self.client, visual=True)
         self.indices = ArmIndices.of(self.arm, self.client)
         self.fingers = {self.indices.links[name] for name in FINGERS}
         self.steps = 0
         self.tracking_error = 0.0  # the largest of any joint so far [rad]
-        self.torque = np.zeros(6)  # the largest of each joint so far [N m]
-        self._hold: int | None = None
+        self.torque = np.zeros(len(workcell.home))  # the largest of each joint so far [N m]
+        self._constraint: int | None = None
         self.blocks = [
             self._spawn(stack.catalogue[int(shape)], int(shape), frame)
             for shape, frame in zip(stack.shapes, frames, strict=True)
@@ -100,7 +102,7 @@ class SimulatedArm:
 
     @property
     def time(self) -> float:
-        """Simulated so far [s]."""
+        """Time simulated so far [s]."""
         return self.steps * self.physics.time_step
 
     def move(self, motion: Motion) -> None:
@@ -112,15 +114,15 @@ class SimulatedArm:
             self._step()
             if self.steps % 8 == 0:
                 self._measure(wanted)
-        self._command(motion.end.tolist(), [0.0] * 6)
+        self._hold_at(motion.end)
         self.wait(_SETTLE)
 
     def open(self, width: float) -> None:
         """Open the jaws; what a fixed constraint held is let go."""
-        if self._hold is not None:
-            bullet.removeConstraint(self._hold, physicsClientId=self.client)
-            self._hold = None
-        self._drive_jaws(width / 2, self.cell.jaws.force)
+        if self._constraint is not None:
+            bullet.removeConstraint(self._constraint, physicsClientId=self.client)
+            self._constraint = None
+        self._drive_jaws(width / 2, self.workcell.jaws.force)
 
     def close(self, force: float) -> None:
         """Close the jaws, or, with a fixed constraint, until they nearly touch, and then hold the block between."""
@@ -133,14 +135,14 @@ class SimulatedArm:
         self._fix(self.blocks[block])
 
     def state(self) -> ArmState:
-        """As the simulation has it."""
+        """Tell where arm and jaws are in the simulation."""
         states = bullet.getJointStates(self.arm, self.indices.arm, physicsClientId=self.client)
         jaws = bullet.getJointStates(self.arm, self.indices.fingers, physicsClientId=self.client)
         return ArmState(np.array([state[0] for state in states]), sum(state[0] for state in jaws))
 
     def stop(self) -> None:
         """Hold every joint where it is."""
-        self._command(self.state().joints.tolist(), [0.0] * 6)
+        self._hold_at(self.state().joints)
 
     def wait(self, seconds: float) -> None:
         """Let time pass."""
@@ -148,7 +150,7 @@ class SimulatedArm:
             self._step()
 
     def frame(self, block: int) -> Floats:
-        """(4, 4) of a block in the table frame."""
+        """Frame (4, 4) of a block in the table frame."""
         shape = self.stack.catalogue[int(self.stack.shapes[block])]
         position, quaternion = bullet.getBasePositionAndOrientation(self.blocks[block], physicsClientId=self.client)
         frame = np.eye(4)
@@ -157,12 +159,12 @@ class SimulatedArm:
         return frame
 
     def built(self) -> Stack:
-        """The blocks where they are."""
+        """Stack of the blocks where they are."""
         size = self.physics.cell_size
         return self.stack.with_poses([block_pose(self.frame(block), size) for block in range(len(self.stack))])
 
     def touches(self) -> set[tuple[str, int, int]]:
-        """What touches what right now: (`arm`, link, block) and (`block`, block, other block)."""
+        """Find what touches what right now: (`arm`, link, block) and (`block`, block, other block)."""
         numbers = {body: number for number, body in enumerate(self.blocks)}
         found = set()
         for point in bullet.getContactPoints(physicsClientId=self.client):
@@ -180,7 +182,7 @@ class SimulatedArm:
         return found
 
     def close_world(self) -> None:
-        """Give the world's memory back."""
+        """Free the memory of the simulation."""
         if self.client >= 0:
             bullet.disconnect(self.client)
             self.client = -1
@@ -213,25 +215,30 @@ class SimulatedArm:
 
     def _prepare_arm(self) -> None:
         """Home position, open jaws, the gear between them, rubber on the pads, the foot free of the table."""
-        home, chain = self.cell.home_joints, ur5_chain()
-        self._efforts = chain.effort.tolist()
+        home = self.workcell.home_joints
+        self._efforts = arm_model(self.workcell.arm).effort.tolist()
         for index, angle in zip(self.indices.arm, home.tolist(), strict=True):
             bullet.resetJointState(self.arm, index, angle, physicsClientId=self.client)
         for index in self.indices.fingers:
-            bullet.resetJointState(self.arm, index, self.cell.jaws.opening / 2, physicsClientId=self.client)
-            bullet.changeDynamics(self.arm, index, lateralFriction=self.cell.jaws.friction, physicsClientId=self.client)
+            bullet.resetJointState(self.arm, index, self.workcell.jaws.opening / 2, physicsClientId=self.client)
+            bullet.changeDynamics(
+                self.arm, index, lateralFriction=self.workcell.jaws.friction, physicsClientId=self.client
+            )
         left, right = self.indices.fingers
         gear = bullet.createConstraint(
             self.arm, left, self.arm, right, bullet.JOINT_GEAR, [0, 1, 0], [0, 0, 0], [0, 0, 0],
             physicsClientId=self.client,
         )  # fmt: skip
         bullet.changeConstraint(gear, gearRatio=-1, maxForce=10_000, erp=0.3, physicsClientId=self.client)
-        for name in (BASE, "shoulder_link"):
+        for name in chain_links(self.workcell.arm)[:2]:
             link = self.indices.links[name]
             bullet.setCollisionFilterPair(self.arm, 0, link, -1, 0, physicsClientId=self.client)
-        self._command(home.tolist(), [0.0] * 6)
-        self._drive_jaws(self.cell.jaws.opening / 2, self.cell.jaws.force)
+        self._hold_at(home)
+        self._drive_jaws(self.workcell.jaws.opening / 2, self.workcell.jaws.force)
         self.steps = 0
+
+    def _hold_at(self, joints: Floats) -> None:
+        self._command(joints.tolist(), [0.0] * len(joints))
 
     def _command(self, positions: list[float], velocities: list[float]) -> None:
         bullet.setJointMotorControlArray(
@@ -241,8 +248,8 @@ class SimulatedArm:
             targetPositions=positions,
             targetVelocities=velocities,
             forces=self._efforts,
-            positionGains=[0.6] * 6,
-            velocityGains=[1.0] * 6,
+            positionGains=[0.6] * len(positions),
+            velocityGains=[1.0] * len(positions),
             physicsClientId=self.client,
         )
 
@@ -260,28 +267,28 @@ class SimulatedArm:
                 return
 
     def _between_fingers(self) -> int | None:
-        """The block at the finger tips; None where there is none."""
+        """Find the block at the finger tips; None where there is none."""
         link = self.indices.links[PALM]
         state = bullet.getLinkState(self.arm, link, computeForwardKinematics=1, physicsClientId=self.client)
         down = Rotation.from_quat(state[5]).as_matrix()[:, 2]
-        tip = np.array(state[4]) + down * self.cell.jaws.reach
+        tip = np.array(state[4]) + down * self.workcell.jaws.reach
         reach = 0.8 * self.physics.cell_size
         distances = [float(np.linalg.norm(self.frame(block)[:3, 3] - tip)) for block in range(len(self.stack))]
         nearest = int(np.argmin(distances))
         return nearest if distances[nearest] < reach else None
 
     def _fix(self, block: int) -> None:
-        """A fixed constraint between palm and block, as they are."""
+        """Put a fixed constraint between palm and block, as they are."""
         link = self.indices.links[PALM]
         state = bullet.getLinkState(self.arm, link, computeForwardKinematics=1, physicsClientId=self.client)
         back = bullet.invertTransform(state[0], state[1])
         there = bullet.getBasePositionAndOrientation(block, physicsClientId=self.client)
         position, quaternion = bullet.multiplyTransforms(*back, *there)
-        self._hold = bullet.createConstraint(
+        self._constraint = bullet.createConstraint(
             self.arm, link, block, -1, bullet.JOINT_FIXED, [0, 0, 0], position, [0, 0, 0], quaternion,
             physicsClientId=self.client,
         )  # fmt: skip
-        bullet.changeConstraint(self._hold, maxForce=500, physicsClientId=self.client)
+        bullet.changeConstraint(self._constraint, maxForce=500, physicsClientId=self.client)
 
     def _measure(self, wanted: list[float]) -> None:
         states = bullet.getJointStates(self.arm, self.indices.arm, physicsClientId=self.client)
@@ -296,31 +303,15 @@ class SimulatedArm:
 
 
 def block_visual(shape: Shape, index: int, cell_size: float, client: int) -> int:
-    """How a block looks: its mesh, in the colour of its number in the catalogue."""
-    corners, normals, faces = _mesh(shape, cell_size)
-    colour = [*(channel / 255 for channel in shape_colour(index)), 1.0]
+    """Make the visual shape of a block: its mesh, in the colour of its number in the catalogue."""
+    points, normals, triangles = prism_mesh(shape)
     return int(
         bullet.createVisualShape(
             bullet.GEOM_MESH,
-            vertices=corners,
-            normals=normals,
-            indices=faces,
-            rgbaColor=colour,
+            vertices=((points - shape.center_of_mass) * cell_size).tolist(),
+            normals=normals.tolist(),
+            indices=triangles.ravel().tolist(),
+            rgbaColor=[*(channel / 255 for channel in shape_colour(index)), 1.0],
             physicsClientId=client,
         )
     )
-
-
-def _mesh(shape: Shape, cell_size: float) -> tuple[list[list[float]], list[list[float]], list[int]]:
-    """Corners [m] about the centre of mass, normals and triangles of a prism; each face has corners of its own."""
-    points = (shape.vertices - shape.center_of_mass) * cell_size
-    corners: list[list[float]] = []
-    normals: list[list[float]] = []
-    triangles: list[int] = []
-    for face in prism_faces(shape):
-        first, polygon = len(corners), points[face]
-        normal = np.cross(polygon[1] - polygon[0], polygon[2] - polygon[0])
-        corners.extend(polygon.tolist())
-        normals.extend([(normal / np.linalg.norm(normal)).tolist()] * len(face))
-        triangles.extend(i for n in range(1, len(face) - 1) for i in (first, first + n, first + n + 1))
-    return corners, normals, triangles

@@ -1,9 +1,8 @@
-"""3-D files hold the same blocks, in metres, with y up."""
+"""GLB files hold the same blocks, in metres, with y up."""
 
 from __future__ import annotations
 
 import json
-import re
 import struct
 from pathlib import Path
 
@@ -11,11 +10,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from stackgen.errors import StackgenError
 from stackgen.geometry import block_vertices
-from stackgen.protocols import Verdict
 from stackgen.stack import Stack
-from stackgen.viz.export import glb_bytes, html_page, prism_mesh, write_glb, write_html
+from stackgen.viz.gltf import glb_bytes, prism_mesh, write_glb
 from stackgen.viz.render import SHAPE_COLOURS
 from stackgen.world import PAPER_CATALOGUE, Catalogue, Shape
 
@@ -85,67 +82,3 @@ def test_any_convex_shape_becomes_a_closed_mesh() -> None:
     assert np.linalg.norm(normals, axis=1) == pytest.approx(1)
     catalogue = Catalogue((hexagon,))
     assert len(glb_bytes(Stack(np.zeros(2, int), np.zeros((2, 6)), catalogue))) > 1000
-
-
-FALLS = Verdict(False, np.arange(5) == 1, np.linspace(0, 1, 5), STACK.with_poses(STACK.poses + 1))
-
-
-def page_data(page: str) -> dict:
-    found = re.search(r"^const data = (.*);$", page, re.MULTILINE)
-    assert found
-    return json.loads(found.group(1))
-
-
-def test_the_page_asks_for_nothing_from_outside(tmp_path: Path) -> None:
-    write_html(tmp_path / "a.html", [STACK, STACK], [FALLS, None], "two")
-    page = (tmp_path / "a.html").read_text()
-    for way_out in (
-        r"https?:",
-        r"\bsrc\s*=",
-        r"\bhref\s*=",
-        r"@import",
-        r"\burl\(",
-        r"\bfetch\(",
-        r"\bimport\b",
-        "XMLHttp",
-    ):
-        assert not re.search(way_out, page), way_out
-    assert "/*DATA*/" not in page
-
-
-def test_the_page_holds_the_stacks_their_verdicts_and_where_the_blocks_ended() -> None:
-    data = page_data(html_page([STACK, STACK], [FALLS, None], "two"))
-    judged, plain = data["stacks"]
-    assert data["title"] == "two"
-    assert [s["name"] for s in data["shapes"]] == list(PAPER_CATALOGUE.names)
-    assert judged["shapes"] == STACK.shapes.tolist()
-    assert judged["fell"] == [1]
-    assert judged["stable"] is False
-    assert np.array(judged["sampled"])[:, :3] == pytest.approx(STACK.poses[:, :3], abs=1e-5)
-    assert np.array(judged["settled"])[:, :3] == pytest.approx(STACK.poses[:, :3] + 1, abs=1e-5)
-    assert "stable" not in plain
-    assert "settled" not in plain
-
-
-def test_the_pages_edges_are_the_prisms_edges() -> None:
-    for shape in page_data(html_page([STACK]))["shapes"]:
-        size = np.array(PAPER_CATALOGUE[PAPER_CATALOGUE.index(shape["name"])].size)
-        points = np.array(shape["points"])
-        lengths = [np.linalg.norm(points[a] - points[b]) for a, b in shape["edges"]]
-        n = len(lengths) // 3
-        assert lengths[:n] == pytest.approx(lengths[n : 2 * n])
-        assert lengths[2 * n :] == pytest.approx([size[1]] * n)
-
-
-def test_a_title_cannot_break_out_of_the_page() -> None:
-    title = "</script><script>alert(1)</script>"
-    page = html_page([STACK], title=title)
-    assert title not in page
-    assert page_data(page)["title"] == title
-
-
-def test_stacks_that_do_not_fit_together_are_refused() -> None:
-    other = Stack(np.zeros(1, int), np.zeros((1, 6)), Catalogue((Shape.box("brick", 2),)))
-    for arguments in ([], [STACK, other]):
-        with pytest.raises(StackgenError, match="one catalogue"):
-            html_page(arguments)

@@ -1,14 +1,12 @@
-"""Stacks as 3-D files: GLB for other programs, one HTML page for looking at them.
+"""Stacks as binary glTF (GLB), and the mesh of a shape.
 
-Both are written directly: a GLB of prisms is a page of code, where a mesh library costs most of a
-second to import.
+The file is written directly: a GLB of prisms is a page of code, where a mesh library costs most of a second to import.
 """
 
 from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,21 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
-from stackgen.protocols import Verdict
 from stackgen.stack import Stack
 from stackgen.viz.raster import prism_faces
-from stackgen.viz.render import SHAPE_COLOURS, Colour
+from stackgen.viz.render import Colour, shape_colour
 from stackgen.world import Shape
 
-_VIEWER = Path(__file__).with_name("viewer.html")
 _FLOAT, _UNSIGNED_INT, _VERTICES, _INDICES = 5126, 5125, 34962, 34963  # glTF's numbers for what is in a buffer
 
 
-def write_glb(
-    path: str | Path, stack: Stack, colours: Sequence[Colour] = SHAPE_COLOURS, cell_size: float = 0.05
-) -> None:
+def write_glb(path: str | Path, stack: Stack, cell_size: float = 0.05) -> None:
     """Write a stack as binary glTF: metres, y up, one node for each block, one mesh and colour for each shape.
 
     A node is named by its block's number and shape, `3 cube`, and stands at the block's pose. World
@@ -38,18 +31,17 @@ def write_glb(
 
     Args:
         path: File to write.
-        stack: What to write.
-        colours: sRGB of each shape by its index; they repeat.
+        stack: The stack to write.
         cell_size: Edge of a cube [m].
 
     Raises:
         StackgenError: If it cannot be written.
     """
-    write_atomically(path, glb_bytes(stack, colours, cell_size))
+    write_atomically(path, glb_bytes(stack, cell_size))
 
 
-def glb_bytes(stack: Stack, colours: Sequence[Colour] = SHAPE_COLOURS, cell_size: float = 0.05) -> bytes:
-    """The content of :func:`write_glb`'s file."""
+def glb_bytes(stack: Stack, cell_size: float = 0.05) -> bytes:
+    """Make the content of :func:`write_glb`'s file."""
     used = np.unique(stack.shapes).tolist()
     buffer = _Buffer()
     meshes, materials = [], []
@@ -62,7 +54,7 @@ def glb_bytes(stack: Stack, colours: Sequence[Colour] = SHAPE_COLOURS, cell_size
         }
         primitive = {"attributes": attributes, "indices": buffer.add(triangles.ravel(), "SCALAR"), "material": material}
         meshes.append({"name": shape.name, "primitives": [primitive]})
-        materials.append(_material(shape.name, colours[index % len(colours)]))
+        materials.append(_material(shape.name, shape_colour(index)))
     quaternions = Rotation.from_rotvec(_y_up(stack.poses[:, 3:])).as_quat()
     nodes: list[dict[str, Any]] = [
         {
@@ -89,7 +81,10 @@ def glb_bytes(stack: Stack, colours: Sequence[Colour] = SHAPE_COLOURS, cell_size
 
 
 def prism_mesh(shape: Shape) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.uint32]]:
-    """Points (n, 3) and normals (n, 3) with each face's corners its own, and triangles (t, 3), in the block frame.
+    """Make a shape's mesh in the block frame [cell]: each face has corners of its own, with its normal.
+
+    Returns:
+        Points (n, 3), their normals (n, 3), and triangles (t, 3) of indices into the points.
 
     >>> points, _, triangles = prism_mesh(Shape.box("cube", 1))
     >>> points.shape, triangles.shape
@@ -107,85 +102,13 @@ def prism_mesh(shape: Shape) -> tuple[NDArray[np.float64], NDArray[np.float64], 
     return np.concatenate(points), np.concatenate(normals), np.array(triangles, dtype=np.uint32)
 
 
-def write_html(
-    path: str | Path, stacks: Sequence[Stack], verdicts: Sequence[Verdict | None] | None = None, title: str = "Stacks"
-) -> None:
-    """Write one page that shows the stacks in 3-D: turn, zoom, choose a stack, let it settle.
-
-    The page asks for nothing from outside and runs in any browser with WebGL.
-
-    Args:
-        path: File to write.
-        stacks: To choose from, all of one catalogue.
-        verdicts: One for each stack, where there is one; adds where the blocks ended and which fell.
-        title: Of the page.
-
-    Raises:
-        StackgenError: If it cannot be written.
-    """
-    write_atomically(path, html_page(stacks, verdicts, title).encode())
-
-
-def html_page(stacks: Sequence[Stack], verdicts: Sequence[Verdict | None] | None = None, title: str = "Stacks") -> str:
-    """The content of :func:`write_html`'s file."""
-    judged = verdicts or [None] * len(stacks)
-    if not stacks or len(judged) != len(stacks) or any(s.catalogue != stacks[0].catalogue for s in stacks):
-        raise StackgenError("a page needs at least one stack, all of one catalogue, and as many verdicts as stacks")
-    shapes = []
-    for index, shape in enumerate(stacks[0].catalogue):
-        points, normals, triangles = prism_mesh(shape)
-        colour = [c / 255 for c in SHAPE_COLOURS[index % len(SHAPE_COLOURS)]]
-        shapes.append(
-            {
-                "name": shape.name,
-                "colour": colour,
-                "points": points.round(6).tolist(),
-                "normals": normals.round(6).tolist(),
-                "triangles": triangles.tolist(),
-                "edges": _edges(shape),
-            }
-        )
-    data = {
-        "title": title,
-        "shapes": shapes,
-        "stacks": [_page_stack(*pair) for pair in zip(stacks, judged, strict=True)],
-    }
-    safe = json.dumps(data, allow_nan=False).replace("<", "\\u003c")  # nothing in it can end the script
-    return _VIEWER.read_text(encoding="utf-8").replace("/*DATA*/null", safe)
-
-
-def _page_stack(stack: Stack, verdict: Verdict | None) -> dict[str, Any]:
-    plain: dict[str, Any] = {"shapes": stack.shapes.tolist(), "sampled": _quaternion_poses(stack)}
-    if verdict is not None:
-        plain["stable"] = bool(verdict.stable)
-        plain["fell"] = np.flatnonzero(verdict.fell).tolist()
-        plain["drop"] = np.asarray(verdict.drop).round(3).tolist()
-        plain["settled"] = _quaternion_poses(verdict.settled)
-    return plain
-
-
-def _quaternion_poses(stack: Stack) -> list[list[float]]:
-    """(k, 7) position [cell] and quaternion (x, y, z, w)."""
-    quaternions = Rotation.from_rotvec(stack.poses[:, 3:]).as_quat()
-    return np.concatenate([stack.poses[:, :3], quaternions], axis=1).round(6).tolist()
-
-
-def _edges(shape: Shape) -> list[list[int]]:
-    """The prism's edges as pairs of indices into its corners' first appearance in :func:`prism_mesh`."""
-    n = len(shape.outline)
-    # The front face's corners come first in order, then the back face's in reverse.
-    back = [2 * n - 1 - i for i in range(n)]
-    ring = [[i, (i + 1) % n] for i in range(n)]
-    return ring + [[back[i], back[j]] for i, j in ring] + [[i, back[i]] for i in range(n)]
-
-
 def _y_up(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """World vectors (..., 3), z up, to glTF's, y up; positions, normals and rotation vectors alike."""
+    """Turn world vectors (..., 3), z up, into glTF's, y up: positions, normals and rotation vectors alike."""
     return np.stack([vectors[..., 0], vectors[..., 2], -vectors[..., 1]], axis=-1) + 0.0
 
 
 def _material(name: str, colour: Colour) -> dict[str, Any]:
-    """A matt surface; glTF wants linear light where pictures have sRGB."""
+    """Make a matt surface; glTF wants linear light where pictures have sRGB."""
     c = np.array(colour) / 255
     linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
     return {
@@ -207,7 +130,7 @@ class _Buffer:
         self.views: list[dict[str, Any]] = []
 
     def add(self, values: NDArray[Any], kind: str) -> int:
-        """Append float vectors or whole-number indices; returns the accessor's number."""
+        """Append float vectors or whole-number indices, and return the accessor's number."""
         is_index = values.dtype.kind == "u"
         array = np.ascontiguousarray(values, dtype="<u4" if is_index else "<f4")
         rows = array.reshape(len(array), -1)
@@ -232,7 +155,7 @@ class _Buffer:
 
 
 def _pack_glb(document: dict[str, Any], data: bytes) -> bytes:
-    """Header, JSON chunk, binary chunk; each padded to four bytes."""
+    """Put header, JSON chunk and binary chunk together, each padded to four bytes."""
     text = json.dumps(document, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 4)
     data += b"\0" * (-len(data) % 4)
