@@ -7,26 +7,22 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from stackgen.baselines.transformer import PoseNetwork, RegressionConfig, TransformerSampler, Trunk
-from stackgen.models.diffusion.denoiser import DenoiserConfig
+from stackgen.baselines.regression import PoseRegressor, RegressionConfig, Trunk
+from stackgen.models.sampler import NetworkSampler
+from stackgen.models.transformer import TransformerConfig
 from stackgen.world import World
 
 
-class PoseRegression(PoseNetwork):
+class TranRegNetwork(PoseRegressor):
     """The denoiser without noisy poses and time, with positional encodings: one forward pass, no randomness but order.
 
     Args:
-        transformer: Architecture, described as the denoiser's.
-        regression: See RegressionConfig.
+        transformer: Architecture, that of the denoiser.
+        regression: How estimated poses are compared with the true ones.
         world: Shapes, size of the silhouette, and N.
     """
 
-    def __init__(
-        self,
-        transformer: DenoiserConfig,
-        regression: RegressionConfig,
-        world: World,
-    ) -> None:
+    def __init__(self, transformer: TransformerConfig, regression: RegressionConfig, world: World) -> None:
         super().__init__(transformer, regression, world)
         self.trunk = Trunk(transformer, transformer.layers, conditioned=False)
 
@@ -35,21 +31,21 @@ class PoseRegression(PoseNetwork):
         return self.head(self.trunk(self.blocks(shapes), mask, memory))
 
     def loss(self, batch: dict[str, Tensor], generator: torch.Generator | None = None) -> Tensor:
-        """(B,) error of the estimated poses.
+        """Compute the error (B,) of the estimated poses.
 
         Args:
-            batch: As the DataModule makes it.
-            generator: Of the blocks' order; the global one by default.
+            batch: Batch of the data module.
+            generator: Source of the blocks' order; the global one by default.
         """
         shapes, mask, poses = self.scene(batch, generator)
         return self.error(self(shapes, mask, self.silhouette(batch["silhouette"])), poses, shapes, mask)
 
     def draw(self, shapes: Tensor, mask: Tensor, memory: Tensor, generator: torch.Generator) -> Tensor:
-        """See PoseNetwork."""
+        """See PoseRegressor."""
         return self(shapes, mask, memory)
 
 
 def make_tran_reg(config: dict[str, Any], world: World) -> tuple[nn.Module, Any]:
-    """Tran-Reg of a card; see stackgen.models.weights.Maker."""
-    parts = DenoiserConfig(**config["transformer"]), RegressionConfig(**config["regression"])
-    return PoseRegression(*parts, world), TransformerSampler
+    """Make Tran-Reg of a card; see stackgen.models.weights.Maker."""
+    parts = TransformerConfig(**config["transformer"]), RegressionConfig(**config["regression"])
+    return TranRegNetwork(*parts, world), NetworkSampler

@@ -8,27 +8,29 @@ from N(0, I). The paper gives the numbers of layers; latent size and weight of t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from stackgen.baselines.transformer import BlockTokens, PoseNetwork, RegressionConfig, TransformerSampler, Trunk
+from stackgen.baselines.regression import BlockTokens, PoseRegressor, RegressionConfig, Trunk
 from stackgen.errors import StackgenError
-from stackgen.models.diffusion.denoiser import POSE, DenoiserConfig, mlp
+from stackgen.models.poses import POSE
+from stackgen.models.sampler import NetworkSampler
+from stackgen.models.transformer import TransformerConfig, mlp
 from stackgen.world import World
 
 
 @dataclass(frozen=True)
 class VAEConfig:
-    """Of the autoencoder.
+    """Settings of the autoencoder.
 
     Args:
-        encoder_layers: How many of the Transformer's layers read the stack; the others make poses (paper: 2 and 4).
+        encoder_layers: Number of the Transformer's layers that read the stack; the others make poses (paper: 2 and 4).
         latent: Size of the latent vector.
-        kl_weight: Of the divergence from N(0, I) [1 / nat], beside an error averaged over blocks and
+        kl_weight: Weight of the divergence from N(0, I) [1 / nat], beside an error averaged over blocks and
             dimensions. With k blocks, Gaussian poses of variance v would make it v / (3 k).
-        kl_warmup: Training steps in which the weight rises from zero, so that the latent vector is put
+        kl_warmup: Number of training steps in which that weight rises from zero, so that the latent vector is put
             to use before it is taxed.
     """
 
@@ -38,7 +40,7 @@ class VAEConfig:
     kl_warmup: int = 1000
 
     def weight(self, step: int) -> float:
-        """Weight of the divergence at a training step.
+        """Compute the weight of the divergence at a training step.
 
         >>> [VAEConfig(kl_weight=0.01, kl_warmup=100).weight(step) for step in (0, 50, 200)]
         [0.0, 0.005, 0.01]
@@ -46,20 +48,13 @@ class VAEConfig:
         return self.kl_weight * min(1.0, step / max(1, self.kl_warmup))
 
 
-class Losses(NamedTuple):
-    """Of each stack (B,): the error of its reconstruction, and the divergence of its posterior [nat]."""
-
-    error: Tensor
-    divergence: Tensor
-
-
-class PoseVAE(PoseNetwork):
+class TranVAENetwork(PoseRegressor):
     """Encoder, latent vector and decoder.
 
     Args:
-        transformer: Architecture, described as the denoiser's; `layers` are those of encoder and decoder together.
-        regression: See RegressionConfig.
-        vae: See VAEConfig.
+        transformer: Architecture, that of the denoiser; `layers` are those of encoder and decoder together.
+        regression: How reconstructed poses are compared with the true ones.
+        vae: Settings of the autoencoder.
         world: Shapes, size of the silhouette, and N.
 
     Raises:
@@ -67,11 +62,7 @@ class PoseVAE(PoseNetwork):
     """
 
     def __init__(
-        self,
-        transformer: DenoiserConfig,
-        regression: RegressionConfig,
-        vae: VAEConfig,
-        world: World,
+        self, transformer: TransformerConfig, regression: RegressionConfig, vae: VAEConfig, world: World
     ) -> None:
         super().__init__(transformer, regression, world)
         if not 0 < vae.encoder_layers < transformer.layers:
@@ -99,12 +90,15 @@ class PoseVAE(PoseNetwork):
         """Normalised poses (B, N, 6) for latent vectors (B, latent)."""
         return self.head(self.decoder(self.blocks(shapes), mask, memory, self.latent_embedding(latent)))
 
-    def losses(self, batch: dict[str, Tensor], generator: torch.Generator | None = None) -> Losses:
-        """The two parts of the evidence bound (Kingma & Welling 2014), one draw of the posterior each.
+    def losses(self, batch: dict[str, Tensor], generator: torch.Generator | None = None) -> tuple[Tensor, Tensor]:
+        """Compute the two parts of the evidence bound (Kingma & Welling 2014), one draw of the posterior each.
 
         Args:
-            batch: As the DataModule makes it.
-            generator: Of order and latent vectors; the global one by default.
+            batch: Batch of the data module.
+            generator: Source of order and latent vectors; the global one by default.
+
+        Returns:
+            Error of each reconstruction, and divergence of each posterior [nat], both (B,).
         """
         shapes, mask, poses = self.scene(batch, generator)
         memory = self.silhouette(batch["silhouette"])
@@ -112,21 +106,21 @@ class PoseVAE(PoseNetwork):
         latent = mean + (0.5 * log_variance).exp() * self._noise(mean.shape, mean, generator)
         error = self.error(self.decode(latent, shapes, mask, memory), poses, shapes, mask)
         divergence = 0.5 * (mean.square() + log_variance.exp() - 1 - log_variance).sum(-1)
-        return Losses(error, divergence)
+        return error, divergence
 
     def draw(self, shapes: Tensor, mask: Tensor, memory: Tensor, generator: torch.Generator) -> Tensor:
-        """See PoseNetwork; latent vectors from N(0, I)."""
+        """See PoseRegressor; latent vectors from N(0, I)."""
         latent = self._noise((len(shapes), self.config.latent), memory, generator)
         return self.decode(latent, shapes, mask, memory)
 
     @staticmethod
     def _noise(size: tuple[int, ...], like: Tensor, generator: torch.Generator | None) -> Tensor:
-        """Of N(0, 1), with another tensor's type and device."""
+        """Draw from N(0, 1), with another tensor's type and device."""
         device = generator.device if generator is not None else like.device
         return torch.randn(size, generator=generator, device=device).to(like)
 
 
 def make_tran_vae(config: dict[str, Any], world: World) -> tuple[nn.Module, Any]:
-    """Tran-VAE of a card; see stackgen.models.weights.Maker."""
-    parts = DenoiserConfig(**config["transformer"]), RegressionConfig(**config["regression"])
-    return PoseVAE(*parts, VAEConfig(**config["vae"]), world), TransformerSampler
+    """Make Tran-VAE of a card; see stackgen.models.weights.Maker."""
+    parts = TransformerConfig(**config["transformer"]), RegressionConfig(**config["regression"])
+    return TranVAENetwork(*parts, VAEConfig(**config["vae"]), world), NetworkSampler

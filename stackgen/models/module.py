@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from stackgen._lightning import pl
-from stackgen.data.shards import manifest_sha256
 from stackgen.errors import StackgenError
 from stackgen.models.optimization import OptimizerConfig, configure_optimizer
+from stackgen.models.poses import PoseNetwork
+from stackgen.models.sampler import NetworkSampler
+from stackgen.models.weights import CHECKPOINT_KEY
 from stackgen.world import World
 
-CHECKPOINT_KEY = "stackgen"
-"""Where a Lightning checkpoint holds the card of its model."""
+T = TypeVar("T")
 
 
 class StackgenModule(pl.LightningModule):
@@ -25,8 +27,8 @@ class StackgenModule(pl.LightningModule):
     `world` its network can be built again; see stackgen.models.weights.
 
     Args:
-        config: Plain data that describes the network.
-        optimizer: Learning rate and its course.
+        config: Description of the network, as JSON allows.
+        optimizer: Learning rate and its course over the training.
     """
 
     kind: str
@@ -40,7 +42,7 @@ class StackgenModule(pl.LightningModule):
         self.dataset: dict[str, Any] | None = None
 
     def make(self, world: World) -> nn.Module:
-        """A new network for a world."""
+        """Make a new network for a world."""
         raise NotImplementedError
 
     def prepare(self, data: Any) -> None:
@@ -58,10 +60,10 @@ class StackgenModule(pl.LightningModule):
             manifest = data.manifest
             self.world = data.world
             self.dataset = {
-                "name": manifest["name"],
-                "sha256": manifest_sha256(manifest),
-                "counts": manifest["counts"],
-                "physics": manifest["physics"],
+                "name": manifest.name,
+                "sha256": manifest.sha256,
+                "counts": manifest.counts,
+                "physics": manifest.physics,
             }
         self.build()
         if data is not None:
@@ -72,7 +74,7 @@ class StackgenModule(pl.LightningModule):
         return configure_optimizer(self, self.optimizer_config)
 
     def generator_of_step(self, index: int, device: torch.device) -> torch.Generator:
-        """A generator that depends on seed, process, epoch and step alone.
+        """Make a generator that depends on seed, process, epoch and step alone.
 
         So a resumed fit draws what the uninterrupted one would have, and no two processes draw the same.
         """
@@ -85,8 +87,15 @@ class StackgenModule(pl.LightningModule):
         # As a float, because Lightning rounds down what it averages of whole numbers (its issue 21859).
         self.log(name, mean, prog_bar=prog_bar, batch_size=float(count), sync_dist=True)  # type: ignore[arg-type]
 
+    def wrapped(self, wrap: Callable[[Any, World], T]) -> T:
+        """Make a sampler or predictor around the network; both share the weights, and the network keeps its mode."""
+        training = self.model.training
+        wrapper = wrap(self.model, self.world)
+        self.model.train(training)
+        return wrapper
+
     def card(self) -> dict[str, Any]:
-        """What is known about the weights; see stackgen.models.weights."""
+        """Say what is known about the weights; see stackgen.models.weights."""
         return {"kind": self.kind, "config": self.config, **self.world.to_json(), "dataset": self.dataset}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -104,3 +113,17 @@ class StackgenModule(pl.LightningModule):
             raise StackgenError(f"the checkpoint is not one of a {type(self).__name__} of stackgen")
         self.world, self.dataset = World.from_json(card), card["dataset"]
         self.build()
+
+
+class PoseModule(StackgenModule):
+    """A StackgenModule around a PoseNetwork."""
+
+    model: PoseNetwork
+
+    def prepare(self, data: Any) -> None:
+        """Take the normalisation of poses from the training data."""
+        self.model.fit_normalization(*data.pose_statistics())
+
+    def sampler(self) -> NetworkSampler:
+        """The model as a StackSampler, sharing its weights."""
+        return self.wrapped(NetworkSampler)

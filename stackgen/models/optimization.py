@@ -13,13 +13,13 @@ from stackgen._lightning import pl
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """Of AdamW. The paper gives none of these; they are ours.
+    """Settings of AdamW. The paper gives none of these; they are ours.
 
     Args:
-        learning_rate: At its peak.
-        warmup: Steps of linear rise.
-        final: Share of the peak that the cosine ends at, when training ends.
-        weight_decay: Decoupled, on matrices only.
+        learning_rate: Peak of the learning rate.
+        warmup: Number of steps in which the learning rate rises to its peak.
+        final: Share of the peak that is left at the end of training.
+        weight_decay: Decoupled weight decay, on matrices only.
         beta2: Decay of the second moment.
     """
 
@@ -31,7 +31,7 @@ class OptimizerConfig:
 
 
 def configure_optimizer(module: pl.LightningModule, config: OptimizerConfig) -> dict[str, Any]:
-    """AdamW for a module's parameters; the cosine spans the trainer's estimated steps."""
+    """Make AdamW for a module's parameters; the cosine spans the trainer's estimated steps."""
     parameters = [p for p in module.parameters() if p.requires_grad]
     groups = [
         {"params": [p for p in parameters if p.ndim >= 2], "weight_decay": config.weight_decay},
@@ -44,7 +44,7 @@ def configure_optimizer(module: pl.LightningModule, config: OptimizerConfig) -> 
 
 
 def learning_rate_share(step: int, total: int, config: OptimizerConfig) -> float:
-    """Share of the peak learning rate at a step.
+    """Compute the share of the peak learning rate at a step.
 
     >>> config = OptimizerConfig(warmup=10, final=0.1)
     >>> [round(learning_rate_share(s, 110, config), 3) for s in (0, 9, 10, 60, 110)]

@@ -23,10 +23,6 @@ from torch import Tensor, nn
 
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
-from stackgen.models.block_list.network import BlockListNetwork, CNNConfig, CNNPredictor
-from stackgen.models.diffusion.denoiser import DenoiserConfig
-from stackgen.models.diffusion.network import DiffusionConfig, DiffusionSampler, PoseDiffusion
-from stackgen.models.diffusion.schedules import ScheduleConfig
 from stackgen.world import World
 
 FORMAT = "stackgen.weights/1"
@@ -34,7 +30,9 @@ FOLDER = Path(__file__).parents[1] / "assets" / "weights"
 DEFAULTS = {"sampler": "ddpm-verdicts", "predictor": "blocklist-small"}
 """What the name `default` stands for."""
 
-_CHECKPOINT_CARD = "stackgen"  # stackgen.models.module.CHECKPOINT_KEY, which this module must not import Lightning for
+CHECKPOINT_KEY = "stackgen"
+"""Where a Lightning checkpoint holds the card of its model."""
+
 _PREFIX = "model."  # of the network inside a LightningModule
 _DAMAGED = (
     *(zipfile.BadZipFile, zlib.error, pickle.UnpicklingError),
@@ -155,7 +153,7 @@ def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     except _DAMAGED as error:
         raise StackgenError(f"{path} is not a checkpoint of stackgen, or is damaged") from error
     parts = checkpoint if isinstance(checkpoint, dict) else {}
-    card, state = parts.get(_CHECKPOINT_CARD), parts.get("state_dict")
+    card, state = parts.get(CHECKPOINT_KEY), parts.get("state_dict")
     if not isinstance(card, dict) or not isinstance(state, dict):
         raise StackgenError(f"{path} is a checkpoint, but not one of stackgen's models")
     tensors = {k.removeprefix(_PREFIX): v for k, v in state.items() if k.startswith(_PREFIX)}
@@ -193,19 +191,3 @@ def build(weights: str | Path, card: dict[str, Any], tensors: dict[str, Tensor],
     except (StackgenError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise StackgenError(f"{weights}: card and weights do not fit together: {str(error).splitlines()[0]}") from error
     return wrap(network, world, card)
-
-
-def make_diffusion(config: dict[str, Any], world: World) -> tuple[nn.Module, Any]:
-    """The diffusion model of a card; see Maker."""
-    network = PoseDiffusion(
-        DenoiserConfig(**config["denoiser"]),
-        ScheduleConfig(**config["schedule"]),
-        DiffusionConfig(**config["diffusion"]),
-        world,
-    )
-    return network, DiffusionSampler
-
-
-def make_block_list(config: dict[str, Any], world: World) -> tuple[nn.Module, Any]:
-    """The block-list network of a card; see Maker."""
-    return BlockListNetwork(CNNConfig(**config["cnn"]), world), CNNPredictor

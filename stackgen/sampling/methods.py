@@ -60,12 +60,12 @@ def _load(weights: str | Path, what: str, makers: Mapping[str, Maker]) -> Any:
 def _samplers() -> dict[str, Maker]:
     from stackgen.baselines.tran_reg import make_tran_reg
     from stackgen.baselines.tran_vae import make_tran_vae
-    from stackgen.models.weights import make_diffusion
+    from stackgen.models.diffusion.sampler import make_diffusion
 
     return {"ddpm": make_diffusion, "tran-reg": make_tran_reg, "tran-vae": make_tran_vae}
 
 
 def _predictors() -> dict[str, Maker]:
-    from stackgen.models.weights import make_block_list
+    from stackgen.models.block_list.predictor import make_block_list
 
     return {"blocklist": make_block_list}

@@ -168,7 +168,7 @@ class _Search:
 
     def add(self, stacks: Sequence[Stack], grid: Grid) -> None:
         """Queue new draws: layouts not checked yet first, among equals the one that looks most like the target."""
-        alike = [silhouette_iou(stack, self.target, grid=grid) for stack in stacks]
+        alike = [silhouette_iou(stack, self.target, grid) for stack in stacks]
         order = sorted(range(len(stacks)), key=lambda i: -alike[i])
         layouts = [layout(stacks[i], grid) for i in order]
         checked = Counter(candidate.layout for candidate in self.checked)
@@ -187,7 +187,7 @@ class _Search:
     def keep(self, stack: Stack, verdict: Verdict, kind: Layout, grid: Grid) -> None:
         """Add a verdict."""
         shown = verdict.settled if verdict.stable else stack
-        self.checked.append(Candidate(stack, verdict, silhouette_iou(shown, self.target, grid=grid), kind))
+        self.checked.append(Candidate(stack, verdict, silhouette_iou(shown, self.target, grid), kind))
 
     def choice(self) -> Choice:
         """What it came to."""

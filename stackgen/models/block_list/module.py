@@ -6,7 +6,8 @@ from dataclasses import asdict
 
 from torch import Tensor
 
-from stackgen.models.block_list.network import BlockListNetwork, CNNConfig, CNNPredictor
+from stackgen.models.block_list.network import BlockListNetwork, CNNConfig
+from stackgen.models.block_list.predictor import CNNPredictor
 from stackgen.models.module import StackgenModule
 from stackgen.models.optimization import OptimizerConfig
 from stackgen.world import World
@@ -16,8 +17,8 @@ class BlockListCNN(StackgenModule):
     """Predicts the block list from the silhouette: the true list's log-probability grows (paper, Eq. 5).
 
     Args:
-        cnn: Architecture.
-        optimizer: Learning rate and its course.
+        cnn: Architecture of the network.
+        optimizer: Learning rate and its course over the training.
     """
 
     kind = "blocklist"
@@ -61,7 +62,4 @@ class BlockListCNN(StackgenModule):
 
     def predictor(self) -> CNNPredictor:
         """The network as a BlockListPredictor, sharing its weights."""
-        was_training = self.model.training
-        predictor = CNNPredictor(self.model, self.world)
-        self.model.train(was_training)
-        return predictor
+        return self.wrapped(CNNPredictor)

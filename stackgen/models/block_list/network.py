@@ -2,32 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
-import numpy as np
-import torch
-from numpy.typing import ArrayLike, NDArray
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from stackgen.errors import StackgenError
 from stackgen.models.block_list.heads import MOST_CLASSES, ChainHead, ClassHead, number_of_lists
-from stackgen.world import Mask, World
+from stackgen.world import World
 
 
 @dataclass(frozen=True)
 class CNNConfig:
-    """Architecture; the defaults are the paper's where it gives them.
+    """Architecture of the block-list CNN; the defaults are the paper's where it gives them.
 
     Args:
-        channels: Of the stem and of every residual layer (paper: 10).
-        layers: Residual layers of two 3 x 3 convolutions each (paper: 30).
-        stem_stride: Of the first convolution; above 1 the residual layers see a smaller picture (ours).
-        pool: Edge of the feature map after max pooling [cells of the map].
+        channels: Number of channels of the stem and of every residual layer (paper: 10).
+        layers: Number of residual layers, each of two 3 x 3 convolutions (paper: 30).
+        stem_stride: Stride of the first convolution; above 1 the residual layers see a smaller picture (ours).
+        pool: Edge of the feature map after max pooling [entries].
         hidden: Width between the two fully connected layers.
-        head: `classes`, one for each block list (paper); `chain`, one shape's count after the other, for
+        head: Last layer: `classes`, one for each block list (paper); `chain`, one shape's count after the other, for
             worlds of too many lists (ours, see stackgen.models.block_list.heads); `auto` takes classes up to 100,000.
     """
 
@@ -43,15 +38,11 @@ class BlockListNetwork(nn.Module):
     """Silhouettes (B, H, W) to a distribution over the block lists of a world.
 
     Args:
-        config: See CNNConfig.
+        config: Architecture.
         world: Says which block lists there are, and the area that one can fill.
     """
 
-    def __init__(
-        self,
-        config: CNNConfig,
-        world: World,
-    ) -> None:
+    def __init__(self, config: CNNConfig, world: World) -> None:
         super().__init__()
         stride = config.stem_stride
         self.stem = nn.Conv2d(1, config.channels, 2 * stride + 1, stride=stride, padding=stride)
@@ -91,56 +82,3 @@ class Residual(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) to the same shape."""
         return F.relu(x + self.norm2(self.conv2(F.relu(self.norm1(self.conv1(x))))))
-
-
-class CNNPredictor:
-    """A BlockListPredictor: the network with its world.
-
-    Args:
-        network: The trained network.
-        world: The world it was trained in.
-        card: What is known about the weights.
-    """
-
-    def __init__(
-        self,
-        network: BlockListNetwork,
-        world: World,
-        card: dict[str, Any] | None = None,
-    ) -> None:
-        self.network = network.eval()
-        self.world = world
-        self.card: dict[str, Any] = card or {}
-
-    @torch.inference_mode()
-    def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
-        """See BlockListPredictor."""
-        if top < 1:
-            raise StackgenError(f"block list: at least one is predicted, not {top}")
-        most = None if limit is None else self._lists(limit, 1)
-        return np.concatenate([self.network.best(part, top, most).cpu().numpy() for part in self._parts(silhouettes)])
-
-    @torch.inference_mode()
-    def log_probabilities(self, silhouettes: Mask, lists: ArrayLike) -> NDArray[np.float64]:
-        """(B, M) natural logarithm of the probability of each of M block lists (M, S), for each silhouette.
-
-        Raises:
-            StackgenError: If a list has no block, or more than N.
-        """
-        counts = self._lists(lists, 2)
-        parts = [self.network(part, counts.expand(len(part), -1, -1)) for part in self._parts(silhouettes)]
-        return torch.cat(parts).double().cpu().numpy()
-
-    def _parts(self, silhouettes: Mask) -> list[Tensor]:
-        """The silhouettes (B, H, W) as the network takes them, in batches."""
-        device = self.network.hidden.weight.device
-        parts = np.array_split(silhouettes, max(1, math.ceil(len(silhouettes) / 256)))
-        return [torch.from_numpy(np.ascontiguousarray(part, dtype=np.float32)).to(device) for part in parts]
-
-    def _lists(self, counts: ArrayLike, dimensions: int) -> Tensor:
-        """Counts (..., S) where the network is."""
-        array = np.asarray(counts, dtype=np.int64)
-        if array.ndim != dimensions or array.shape[-1] != len(self.world.catalogue):
-            names = ", ".join(self.world.catalogue.names)
-            raise StackgenError(f"block list: one count for each of {names}, got an array {array.shape}")
-        return torch.from_numpy(array).to(self.network.hidden.weight.device)

@@ -3,35 +3,35 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from stackgen.models.diffusion.denoiser import DenoiserConfig
-from stackgen.models.diffusion.network import DiffusionConfig, DiffusionSampler, PoseDiffusion
+from stackgen.models.diffusion.network import DiffusionConfig, PoseDiffusion
+from stackgen.models.diffusion.sampler import DiffusionSampler
 from stackgen.models.diffusion.schedules import ScheduleConfig
-from stackgen.models.module import StackgenModule
+from stackgen.models.module import PoseModule
 from stackgen.models.optimization import OptimizerConfig
+from stackgen.models.transformer import TransformerConfig
 from stackgen.world import World
 
 
-class DDPM(StackgenModule):
+class DDPM(PoseModule):
     """StackGen's denoising diffusion model (paper, "Method"); the defaults are the paper's.
 
     Args:
-        denoiser: Architecture.
+        denoiser: Architecture of the denoiser.
         schedule: Noise schedule.
-        diffusion: Target and normalisation.
-        optimizer: Learning rate and its course.
-        draws: Noise draws of each sample in a training step.
+        diffusion: Target of the training and normalisation of the poses.
+        optimizer: Learning rate and its course over the training.
+        draws: Number of noise draws of each sample in a training step.
     """
 
     kind = "ddpm"
 
     def __init__(
         self,
-        denoiser: DenoiserConfig = DenoiserConfig(),  # noqa: B008 - frozen
+        denoiser: TransformerConfig = TransformerConfig(),  # noqa: B008 - frozen
         schedule: ScheduleConfig = ScheduleConfig(),  # noqa: B008
         diffusion: DiffusionConfig = DiffusionConfig(),  # noqa: B008
         optimizer: OptimizerConfig = OptimizerConfig(),  # noqa: B008
@@ -46,10 +46,6 @@ class DDPM(StackgenModule):
     def make(self, world: World) -> PoseDiffusion:
         """See StackgenModule."""
         return PoseDiffusion(*self._parts, world)
-
-    def prepare(self, data: Any) -> None:
-        """Take the normalisation of poses from the training data."""
-        self.model.fit_normalization(*data.pose_statistics())
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
         """One step of Eq. 3's loss, logged by quarter of the steps too."""
@@ -80,7 +76,4 @@ class DDPM(StackgenModule):
 
     def sampler(self) -> DiffusionSampler:
         """The model as a StackSampler, sharing its weights."""
-        was_training = self.model.training
-        sampler = DiffusionSampler(self.model, self.world)
-        self.model.train(was_training)
-        return sampler
+        return self.wrapped(DiffusionSampler)

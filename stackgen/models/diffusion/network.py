@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
-import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from stackgen.errors import StackgenError
-from stackgen.models.diffusion.denoiser import POSE, Denoiser, DenoiserConfig, raster_order
-from stackgen.models.diffusion.samplers import Predict, ancestral, multistep
+from stackgen.models.diffusion.denoiser import Denoiser
 from stackgen.models.diffusion.schedules import Schedule, ScheduleConfig
 from stackgen.models.diffusion.settings import SamplerConfig
-from stackgen.models.network_sampler import NetworkSampler
-from stackgen.stack import Stack
-from stackgen.world import Mask, World
+from stackgen.models.diffusion.solvers import Predict, ancestral, multistep
+from stackgen.models.poses import POSE, PoseNetwork, raster_order
+from stackgen.models.transformer import TransformerConfig
+from stackgen.world import World
 
 
 @dataclass(frozen=True)
@@ -25,16 +23,16 @@ class DiffusionConfig:
     """What is diffused and what the network estimates.
 
     Args:
-        prediction: `epsilon`, the noise (paper), or `v` (Salimans & Ho 2022), which weights the
-            noisy steps, where the layout is decided, more.
+        prediction: What the network estimates: `epsilon`, the noise (paper), or `v` (Salimans & Ho 2022), which
+            weights the noisy steps, where the layout is decided, more.
         clip: Bound of the clean estimate while sampling, in standard deviations; null for none.
-        least_std: Lower bound of the standard deviation that a dimension is divided by [cell, rad].
+        least_std: Lower bound of the standard deviation that a dimension of the poses is divided by [cell, rad].
             Settled stacks hardly vary in y and in rotation; without a bound the rare slanted block
             would be hundreds of standard deviations away.
-        variance: Of ancestral sampling's noise: `beta` (paper) or `posterior`, see samplers.ancestral.
-        drop_silhouette: Share of the training samples that are shown an empty picture, so that the model can be
-            guided by itself without the silhouette (Ho & Salimans 2022).
-        guidance: Weight of that guidance while sampling; 1 is none. It needs `drop_silhouette`.
+        variance: Variance of the noise that `ddpm` adds while sampling: `beta` (paper) or the smaller `posterior`.
+        drop_silhouette: Share of the training samples that are shown an empty picture, so that classifier-free
+            guidance is possible (Ho & Salimans 2022).
+        guidance: Weight of classifier-free guidance while sampling; 1 is none. It needs `drop_silhouette`.
 
     Raises:
         StackgenError: If a number is out of its range.
@@ -54,35 +52,28 @@ class DiffusionConfig:
             raise StackgenError("diffusion.guidance needs diffusion.drop_silhouette, such as 0.1")
 
 
-class PoseDiffusion(nn.Module):
+class PoseDiffusion(PoseNetwork):
     """The denoiser with its schedule and the normalisation of poses.
 
     Args:
-        denoiser, schedule, diffusion: Their descriptions.
+        denoiser: Architecture of the denoiser.
+        schedule: Noise schedule.
+        diffusion: What is diffused and what the network estimates.
         world: Shapes, size of the silhouette, and N.
     """
 
-    mean: Tensor
-    std: Tensor
-
     def __init__(
-        self,
-        denoiser: DenoiserConfig,
-        schedule: ScheduleConfig,
-        diffusion: DiffusionConfig,
-        world: World,
+        self, denoiser: TransformerConfig, schedule: ScheduleConfig, diffusion: DiffusionConfig, world: World
     ) -> None:
-        super().__init__()
+        super().__init__(diffusion.least_std)
         self.config = diffusion
         self.schedule = Schedule(schedule)
         self.denoiser = Denoiser(denoiser, world)
-        self.register_buffer("mean", torch.zeros(POSE))
-        self.register_buffer("std", torch.ones(POSE))
 
-    def fit_normalization(self, mean: ArrayLike, std: ArrayLike) -> None:
-        """Take over the training poses' statistics (6,) [cell, rad]."""
-        self.mean.copy_(torch.as_tensor(np.asarray(mean)))
-        self.std.copy_(torch.as_tensor(np.asarray(std)).clamp(min=max(self.config.least_std, 1e-6)))
+    @property
+    def trims(self) -> bool:
+        """See PoseNetwork."""
+        return self.denoiser.config.trims
 
     def loss(
         self,
@@ -91,12 +82,12 @@ class PoseDiffusion(nn.Module):
         generator: torch.Generator | None = None,
         drop_silhouette: float = 0.0,
     ) -> tuple[Tensor, Tensor]:
-        """Mean squared error per sample and draw, averaged over its real blocks (paper, Eq. 3).
+        """Compute the mean squared error per sample and draw, averaged over its real blocks (paper, Eq. 3).
 
         Args:
-            batch: As the DataModule makes it.
-            draws: Noise draws of every sample; they share one look at the silhouette.
-            generator: Of steps and noise; the global one by default.
+            batch: Batch of the data module.
+            draws: Number of noise draws of every sample; they share one look at the silhouette.
+            generator: Source of steps and noise; the global one by default.
             drop_silhouette: Share of the samples that are shown an empty picture.
 
         Returns:
@@ -131,7 +122,7 @@ class PoseDiffusion(nn.Module):
     def _own_estimate(
         self, noisy: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor, draws: int
     ) -> Tensor:
-        """What the network makes of every second draw (of every second sample, where each has one); zeros elsewhere."""
+        """Estimate the clean poses of every second draw (or sample, where each has one draw); zeros elsewhere."""
         rows = torch.arange(len(noisy), device=noisy.device)
         chosen = rows % 2 == 0
         if draws == 1:
@@ -165,13 +156,7 @@ class PoseDiffusion(nn.Module):
         generator: torch.Generator,
         sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
     ) -> Tensor:
-        """Poses (B, N, 6) [cell, rad] for silhouettes (B / n, H, W), each serving n rows of shapes (B, N).
-
-        Args:
-            silhouettes, shapes, mask: As the denoiser takes them.
-            generator: Of all noise.
-            sampler: The way from noise to poses.
-        """
+        """See PoseNetwork; `sampler` says how to get from noise to poses."""
         config = self.complete(sampler)
         predict = self._predictor(silhouettes, shapes, mask)
         if config.guidance is not None and config.guidance != 1:
@@ -188,7 +173,7 @@ class PoseDiffusion(nn.Module):
         return x * self.std + self.mean
 
     def complete(self, sampler: SamplerConfig) -> SamplerConfig:
-        """A sampler's settings with this model's own for what is null.
+        """Take this model's own settings for what is null in a sampler's.
 
         Raises:
             StackgenError: If they do not fit the model.
@@ -197,7 +182,7 @@ class PoseDiffusion(nn.Module):
         return sampler.complete(self.schedule.steps, self.config.variance, own)
 
     def _predictor(self, silhouettes: Tensor, shapes: Tensor, mask: Tensor) -> Predict:
-        """What estimates the clean poses of some scenes; it reads their silhouettes once."""
+        """Make the function that estimates the clean poses of some scenes; it reads their silhouettes once."""
         memory = self.denoiser.encode(silhouettes)
         last: Tensor | None = None
 
@@ -208,13 +193,8 @@ class PoseDiffusion(nn.Module):
 
         return predict
 
-    @property
-    def trims(self) -> bool:
-        """See DenoiserConfig."""
-        return self.denoiser.config.trims
-
     def _guided(self, own: Predict, blind: Predict, config: SamplerConfig) -> Predict:
-        """Away from what the model would do without the silhouette (classifier-free guidance, Ho & Salimans 2022)."""
+        """Lead away from what the model does without the silhouette (classifier-free guidance, Ho & Salimans 2022)."""
         assert config.guided is not None and config.guidance is not None
         first, last = (share * self.schedule.steps for share in config.guided)
         weight = config.guidance
@@ -226,52 +206,3 @@ class PoseDiffusion(nn.Module):
             return self._bounded(theirs + weight * (own(x, t) - theirs)) if weight else theirs
 
         return predict
-
-
-class DiffusionSampler(NetworkSampler[PoseDiffusion]):
-    """A StackSampler: the diffusion model with its world.
-
-    Args:
-        model: The trained network.
-        world: The world it was trained in.
-        card: What is known about the weights.
-        batch: How many stacks are denoised together, at most.
-        sampler: The way from noise to poses; what is null is as the card has it, else the model.
-
-    Raises:
-        StackgenError: If the settings do not fit the model.
-    """
-
-    def __init__(
-        self,
-        model: PoseDiffusion,
-        world: World,
-        card: dict[str, Any] | None = None,
-        batch: int = 512,
-        sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
-    ) -> None:
-        super().__init__(model, world, card, batch)
-        self.sampler = self.model.complete(sampler.over(SamplerConfig.of_card(self.card)))
-
-    def configured(self, sampler: SamplerConfig) -> DiffusionSampler:
-        """The same model with other settings, where they are not null."""
-        return DiffusionSampler(self.model, self.world, self.card, self.batch, sampler)
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """How it samples, for the record."""
-        return self.sampler.given()
-
-    def sample_batch(
-        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
-    ) -> list[list[Stack]]:
-        """See StackSampler.
-
-        Raises:
-            StackgenError: If a block list is empty or longer than the model takes, or sizes differ.
-        """
-
-        def draw(pictures: Tensor, shapes: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
-            return self.model.sample(pictures, shapes, mask, generator, self.sampler)
-
-        return self._answer(silhouettes, counts, num_samples, seed, draw)

@@ -15,11 +15,11 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from stackgen.data.preferences import Preferences
-from stackgen.models.diffusion.denoiser import DenoiserConfig
 from stackgen.models.diffusion.module import DDPM
 from stackgen.models.diffusion.network import DiffusionConfig, PoseDiffusion
 from stackgen.models.diffusion.schedules import ScheduleConfig
 from stackgen.models.optimization import OptimizerConfig
+from stackgen.models.transformer import TransformerConfig
 
 _REFERENCE = "reference"
 _OTHER = 2**32
@@ -32,17 +32,21 @@ class VerdictTuning(DDPM):
     Its checkpoints are those of a DDPM.
 
     Args:
-        denoiser, schedule, diffusion, optimizer, draws: See DDPM.
-        preferences: File of `stackgen prefer`.
-        beta: How sharply the network is held to prefer; large keeps it near where it began.
-        weight: Of this loss beside the data's.
-        pairs: In each step, with two noise draws each.
+        preferences: File of pairs that `stackgen prefer` wrote.
+        denoiser: Architecture of the denoiser.
+        schedule: Noise schedule.
+        diffusion: Target of the training and normalisation of the poses.
+        optimizer: Learning rate and its course over the training.
+        draws: Number of noise draws of each sample in a training step.
+        beta: Sharpness of the preference; a large one keeps the network near where it began.
+        weight: Weight of the pairs' loss beside the data's.
+        pairs: Number of pairs in each step, with two noise draws each.
     """
 
     def __init__(
         self,
         preferences: str,
-        denoiser: DenoiserConfig = DenoiserConfig(),  # noqa: B008 - frozen
+        denoiser: TransformerConfig = TransformerConfig(),  # noqa: B008 - frozen
         schedule: ScheduleConfig = ScheduleConfig(),  # noqa: B008
         diffusion: DiffusionConfig = DiffusionConfig(),  # noqa: B008
         optimizer: OptimizerConfig = OptimizerConfig(),  # noqa: B008

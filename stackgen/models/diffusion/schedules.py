@@ -12,12 +12,13 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class ScheduleConfig:
-    """A noise schedule, described.
+    """Description of a noise schedule; the defaults are the paper's.
 
     Args:
-        steps: T.
-        kind: `linear` in beta, as the paper has it, or `cosine` (Nichol & Dhariwal 2021).
-        beta_start, beta_end: Ends of the linear schedule (paper: 1e-4 and 0.189).
+        steps: Number of diffusion steps T.
+        kind: Course of the noise: `linear` in beta (paper), or `cosine` (Nichol & Dhariwal 2021).
+        beta_start: First beta of the linear schedule.
+        beta_end: Last beta of the linear schedule.
     """
 
     steps: int = 50
@@ -61,12 +62,12 @@ class Schedule:
         )
 
     def half_log_snr(self, t: int, before: int) -> float:
-        """By how much half the log of the signal-to-noise ratio grows from step `before` to step t >= 1."""
+        """Compute how much half the log of the signal-to-noise ratio grows from step `before` to step t >= 1."""
         ratios = [self.alpha_bar[step].item() / (1 - self.alpha_bar[step].item()) for step in (t, before)]
         return 0.5 * math.log(ratios[0] / ratios[1])
 
     def subset(self, number: int, spacing: float = 1.0) -> list[int]:
-        """Some of the steps T, ..., 1, falling, T among them: T (1 - i / number)^spacing, none twice.
+        """Choose steps from T, ..., 1, falling, with T: T (1 - i / number)^spacing, rounded, without duplicates.
 
         >>> Schedule(ScheduleConfig()).subset(5), Schedule(ScheduleConfig()).subset(5, 1.3)
         ([50, 40, 30, 20, 10], [50, 37, 26, 15, 6])
@@ -78,6 +79,6 @@ class Schedule:
         return chosen[::-1]
 
     def diffuse(self, clean: Tensor, noise: Tensor, t: Tensor) -> Tensor:
-        """Forward process (paper, Eq. 1): clean and noise (B, N, D), t (B,)."""
+        """Run the forward process (paper, Eq. 1): clean and noise (B, N, D), t (B,)."""
         signal, sigma = self.signal_and_noise(t)
         return signal * clean + sigma * noise

@@ -17,19 +17,19 @@ _OF_KIND = {"ddpm": "variance", "ddim": "eta", "dpm": "eta"}
 
 @dataclass(frozen=True)
 class SamplerConfig:
-    """The way from noise to poses; what is null is as the weights have it.
+    """Settings of the way from noise to poses; what is null is taken from the weights.
 
     Args:
-        kind: `ddpm`, ancestral (paper); `ddim` (Song et al. 2021); `dpm`, DPM-Solver++ (2M), which looks back
-            one step (Lu et al. 2022).
-        steps: Calls of the network, 1..T; by default all T.
-        spacing: At 1 the steps lie evenly in t; above, they get closer towards the clean end, as the power
-            `spacing` of even ones.
+        kind: Solver: `ddpm`, ancestral sampling (paper); `ddim` (Song et al. 2021); `dpm`, DPM-Solver++ (2M), which
+            looks back one step (Lu et al. 2022).
+        steps: Number of calls of the network, 1..T; all T by default.
+        spacing: Spacing of the steps: at 1 they lie evenly in t; above, they get closer towards the clean end, as
+            the power `spacing` of even ones.
         eta: Share of fresh noise in each step of `ddim` and `dpm`: 0 for none, 1 for as much as `ddpm` has.
-        variance: Of the noise of `ddpm`: `beta` (paper) or `posterior`, see samplers.ancestral.
+        variance: Variance of the noise of `ddpm`: `beta` (paper) or the smaller `posterior`.
         guidance: Weight of classifier-free guidance (Ho & Salimans 2022), for a model that was trained with
             `drop_silhouette`: 1 is none, 0 leaves the silhouette out.
-        guided: Where guidance acts, as shares of T: from which to which t.
+        guided: Range of t in which guidance acts, as two shares of T.
 
     Raises:
         StackgenError: If a number is out of its range.
@@ -58,7 +58,7 @@ class SamplerConfig:
             raise StackgenError(f"sampler.guided must be two shares of T, such as [0.3, 1], got {list(self.guided)}")
 
     def over(self, base: SamplerConfig) -> SamplerConfig:
-        """These settings, and those of `base` for what is null here; another kind's noise does not carry over.
+        """Take the settings of `base` for what is null here; the noise of another kind does not carry over.
 
         >>> SamplerConfig(kind="ddim").over(SamplerConfig(kind="ddpm", steps=8, variance="beta"))
         ... # doctest: +ELLIPSIS
@@ -71,7 +71,7 @@ class SamplerConfig:
     def complete(
         self, steps: int, variance: Literal["beta", "posterior"], guidance: float | None = None
     ) -> SamplerConfig:
-        """Nothing null that matters: with the model's T, its `variance` and its own `guidance`, null if it has none.
+        """Fill in all that matters: a model's T, its `variance`, and its `guidance` (null if it has none).
 
         Raises:
             StackgenError: If a setting belongs to another kind, or there are more steps than T.
@@ -79,7 +79,7 @@ class SamplerConfig:
         kind = self.kind or "ddpm"
         for name in {"eta", "variance"} - {_OF_KIND[kind]}:
             if getattr(self, name) is not None:
-                raise StackgenError(f"sampler.{name} is not for {kind}; set {_OF_KIND[kind]}, or another kind")
+                raise StackgenError(f"sampler.{name} is not for {kind}; set {_OF_KIND[kind]}, or choose another kind")
         if self.steps is not None and self.steps > steps:
             raise StackgenError(f"sampler.steps: this model has {steps} steps, not {self.steps}")
         if guidance is None and (self.guidance is not None or self.guided is not None):
@@ -93,10 +93,10 @@ class SamplerConfig:
 
     @staticmethod
     def of_card(card: Mapping[str, Any]) -> SamplerConfig:
-        """What the card of some weights says of sampling them.
+        """Read how to sample some weights from their card.
 
         Raises:
-            StackgenError: If it says what no sampler can do.
+            StackgenError: If the card has settings that no sampler has.
         """
         try:
             return SamplerConfig(**card.get("sampler", {}))
@@ -104,5 +104,5 @@ class SamplerConfig:
             raise StackgenError(f"the weights card of {card.get('name')}: sampler: {error}") from error
 
     def given(self) -> dict[str, Any]:
-        """What is not null, as JSON allows."""
+        """Give the settings that are not null, as JSON allows."""
         return {name: value for name, value in asdict(self).items() if value is not None}

@@ -1,12 +1,11 @@
 """Trained networks as StackSamplers: questions in batches, answers as stacks.
 
-Legend: B scenes, S shapes, N blocks at most, H x W pixels.
+Legend: B scenes, S shapes, N blocks at most, n stacks per scene, H x W pixels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,59 +13,40 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from stackgen.errors import StackgenError
-from stackgen.models.diffusion.denoiser import POSE
+from stackgen.models.poses import POSE, PoseNetwork
 from stackgen.stack import Stack, shapes_of
 from stackgen.world import Mask, World
 
-Draw = Callable[[Tensor, Tensor, Tensor, torch.Generator], Tensor]
-"""Silhouettes (B, H, W), shapes (B * n, N) and their mask, to poses (B * n, N, 6) [cell, rad]."""
 
-
-class PoseModel(Protocol):
-    """A network that estimates or samples poses.
-
-    `mean` is a part of its normalisation and lies on its device; `trims` says that padding may be
-    left out, which is wrong where a network was trained to see it.
-    """
-
-    @property
-    def mean(self) -> Tensor: ...
-
-    @property
-    def trims(self) -> bool: ...
-
-    def eval(self) -> Self: ...
-
-
-M = TypeVar("M", bound=PoseModel)
-
-
-class NetworkSampler(Generic[M]):
-    """What samplers of trained networks share: their world, and questions answered some at a time.
+class NetworkSampler:
+    """A StackSampler: a network of poses with its world, asked for some stacks at a time.
 
     Args:
-        model: The trained network.
-        world: The world it was trained in.
+        model: Trained network.
+        world: World it was trained in.
         card: What is known about the weights.
-        batch: How many stacks are made together, at most.
+        batch: Largest number of stacks that are made together.
     """
 
-    def __init__(
-        self,
-        model: M,
-        world: World,
-        card: dict[str, Any] | None = None,
-        batch: int = 512,
-    ) -> None:
+    def __init__(self, model: PoseNetwork, world: World, card: dict[str, Any] | None = None, batch: int = 512) -> None:
         self.world = world
         self.card: dict[str, Any] = card or {}
         self.batch = batch
-        self.model = model.eval()
+        self.model: Any = model.eval()
 
-    def _answer(
-        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int, draw: Draw
+    @property
+    def settings(self) -> dict[str, Any]:
+        """How it samples, for the record."""
+        return {}
+
+    def draw(self, silhouettes: Tensor, shapes: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
+        """Draw poses (B * n, N, 6) [cell, rad]; see PoseNetwork.sample."""
+        return self.model.sample(silhouettes, shapes, mask, generator)
+
+    def sample_batch(
+        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
     ) -> list[list[Stack]]:
-        """`num_samples` stacks for each silhouette and block list.
+        """See StackSampler.
 
         Raises:
             StackgenError: If a block list is empty or longer than the model takes, or sizes differ.
@@ -80,7 +60,7 @@ class NetworkSampler(Generic[M]):
             part = slice(start, start + scenes)
             longest = int(totals[part].max()) if self.model.trims else self.world.max_blocks
             shapes, mask = pad_shapes(counts[part], longest)
-            poses = draw(
+            poses = self.draw(
                 torch.from_numpy(np.ascontiguousarray(silhouettes[part], dtype=np.float32)).to(device),
                 torch.from_numpy(np.repeat(shapes, num_samples, axis=0)).to(device),
                 torch.from_numpy(np.repeat(mask, num_samples, axis=0)).to(device),

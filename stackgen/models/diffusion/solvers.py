@@ -1,6 +1,6 @@
-"""Samplers: plain functions that turn noise into samples, given something that estimates the clean poses.
+"""Solvers: plain functions that turn noise into samples, given a function that estimates the clean poses.
 
-All walk down a subset of the steps T, ..., 1 and end with the estimate of the last one.
+They walk down a subset of the steps T, ..., 1 and end with the estimate at the last one.
 """
 
 from __future__ import annotations
@@ -15,9 +15,6 @@ from stackgen.models.diffusion.schedules import Schedule
 Predict = Callable[[Tensor, Tensor], Tensor]
 """x_t (B, N, D) and t (1,) to an estimate of the clean sample (B, N, D)."""
 
-Callback = Callable[[int, Tensor], None]
-"""Told (t, x_t) before each step, and (0, x_0) at the end."""
-
 
 def ancestral(
     predict: Predict,
@@ -26,28 +23,26 @@ def ancestral(
     generator: torch.Generator,
     steps: Sequence[int] | None = None,
     posterior_variance: bool = False,
-    callback: Callback | None = None,
 ) -> Tensor:
-    """DDPM's reverse process (paper, Eq. 3), no noise at the last step.
+    """Run DDPM's reverse process (paper, Eq. 3), without noise at the last step.
 
     Written with the clean estimate instead of the noise, which is the same formula as long as the
     estimate is not bounded: the mean of q(x_s | x_t, x_0) (Ho et al. 2020, Eq. 7). Where steps are left
     out, beta is that of the whole step from t to s.
 
     Args:
-        predict: The model.
+        predict: Estimate of the clean sample.
         noise: (B, N, D) sample of N(0, I), x_T.
         schedule: T and the betas.
-        generator: Of the noise on the way; its draws are shaped like `noise`.
-        steps: Falling, from T; all by default.
-        posterior_variance: Of the noise on the way: sigma_t^2 = beta_t (paper), or that of
-            q(x_s | x_t, x_0), which is smaller. In few steps the former leaves more noise in x_1
-            than the last step takes away: a standard deviation of 0.06 in 50 steps.
-        callback: See Callback.
+        generator: Source of the noise on the way; its draws are shaped like `noise`.
+        steps: Steps to take, falling from T; all by default.
+        posterior_variance: Whether the noise on the way has the variance of q(x_s | x_t, x_0) instead of the
+            larger sigma_t^2 = beta_t (paper). In few steps the latter leaves more noise in x_1 than the last
+            step takes away: a standard deviation of 0.06 in 50 steps.
     """
     x = noise
     for t, s in _pairs(steps or range(schedule.steps, 0, -1)):
-        clean = _estimate(predict, x, t, callback)
+        clean = predict(x, torch.tensor([t], device=x.device))
         bar, bar_after = schedule.alpha_bar[t].item(), schedule.alpha_bar[s].item()
         alpha = bar / bar_after
         beta = 1 - alpha
@@ -55,8 +50,6 @@ def ancestral(
         if s > 0:
             variance = beta * (1 - bar_after) / (1 - bar) if posterior_variance else beta
             x = x + variance**0.5 * _fresh(x, generator)
-    if callback:
-        callback(0, x)
     return x
 
 
@@ -68,11 +61,10 @@ def multistep(
     steps: Sequence[int] | None = None,
     order: int = 1,
     eta: float = 0.0,
-    callback: Callback | None = None,
 ) -> Tensor:
-    """DDIM (order 1) and DPM-Solver++ (2M) with data prediction (order 2), with or without fresh noise.
+    """Run DDIM (order 1) or DPM-Solver++ (2M) with data prediction (order 2), with or without fresh noise.
 
-    One formula for both. DDIM (Song et al. 2021, Eq. 12) goes from x_t to
+    Both are one formula. DDIM (Song et al. 2021, Eq. 12) goes from x_t to
 
         x_s = sqrt(abar_s) x_0 + sqrt(1 - abar_s - sigma^2) eps + sigma z
 
@@ -84,13 +76,17 @@ def multistep(
     order 1.
 
     Args:
-        predict, noise, schedule, generator, steps, callback: As in `ancestral`.
-        order: 1 or 2.
+        predict: Estimate of the clean sample.
+        noise: (B, N, D) sample of N(0, I), x_T.
+        schedule: T and the betas.
+        generator: Source of the noise on the way; its draws are shaped like `noise`.
+        steps: Steps to take, falling from T; all by default.
+        order: Order of the solver, 1 or 2.
         eta: Share of fresh noise, 0..1.
     """
     x, before = noise, None
     for t, s in _pairs(steps or range(schedule.steps, 0, -1)):
-        clean = _estimate(predict, x, t, callback)
+        clean = predict(x, torch.tensor([t], device=x.device))
         target = clean
         if order == 2 and before is not None and s > 0:
             last, u = before
@@ -103,20 +99,12 @@ def multistep(
         x = bar_after**0.5 * target + max(0.0, 1 - bar_after - variance) ** 0.5 * noise_in_x
         if variance > 0:
             x = x + variance**0.5 * _fresh(x, generator)
-    if callback:
-        callback(0, x)
     return x
 
 
 def _pairs(steps: Sequence[int]) -> Iterator[tuple[int, int]]:
     """Each step with the one after it; 0 after the last."""
     return zip(steps, [*steps[1:], 0], strict=True)
-
-
-def _estimate(predict: Predict, x: Tensor, t: int, callback: Callback | None) -> Tensor:
-    if callback:
-        callback(t, x)
-    return predict(x, torch.tensor([t], device=x.device))
 
 
 def _fresh(x: Tensor, generator: torch.Generator) -> Tensor:

@@ -15,25 +15,22 @@ from typing import Literal
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
-from torch.nn import functional as F
 
 from stackgen.errors import StackgenError
-from stackgen.models.diffusion.denoiser import (
-    POSE,
-    CrossLayer,
-    DenoiserConfig,
-    EncoderLayer,
+from stackgen.models.poses import PoseNetwork, ranks, raster_order
+from stackgen.models.transformer import (
     Patches,
-    ranks,
-    raster_order,
+    TransformerConfig,
+    block_layers,
+    final_norm,
+    memory_layers,
+    pose_head,
+    run_blocks,
     sinusoids,
 )
-from stackgen.models.network_sampler import NetworkSampler
-from stackgen.stack import Stack
-from stackgen.world import Mask, World
+from stackgen.world import World
 
 _FORBIDDEN = 1e6  # cost of giving a block another shape's pose
 
@@ -43,10 +40,10 @@ class RegressionConfig:
     """How estimated poses are compared with the true ones. The paper gives none of these; they are ours.
 
     Args:
-        assignment: Which of several equal blocks' poses is whose target: `raster`, by their order
-            from the bottom up and left to right; or `matched`, as fits the estimate best.
-        loss: `squared`, whose best answer is the mean of the possible poses, or `absolute`, their median.
-        least_std: Lower bound of the standard deviation that a dimension is divided by [cell, rad].
+        assignment: Rule for whose pose is whose target among equal blocks: `raster`, by their order from the
+            bottom up and left to right; or `matched`, as fits the estimate best.
+        loss: Loss: `squared`, whose best answer is the mean of the possible poses, or `absolute`, their median.
+        least_std: Lower bound of the standard deviation that a dimension of the poses is divided by [cell, rad].
     """
 
     assignment: Literal["raster", "matched"] = "raster"
@@ -59,7 +56,7 @@ class BlockTokens(nn.Module):
 
     positions: Tensor
 
-    def __init__(self, config: DenoiserConfig, world: World) -> None:
+    def __init__(self, config: TransformerConfig, world: World) -> None:
         super().__init__()
         self.shape_embedding = nn.Embedding(len(world.catalogue), config.width)
         self.rank_embedding = nn.Embedding(world.max_blocks, config.width) if config.ordered else None
@@ -76,11 +73,10 @@ class BlockTokens(nn.Module):
 class SilhouetteTokens(nn.Module):
     """Silhouette to tokens, as the denoiser makes them: patches, and in `cross` a short encoder over them."""
 
-    def __init__(self, config: DenoiserConfig, image_size: int) -> None:
+    def __init__(self, config: TransformerConfig, image_size: int) -> None:
         super().__init__()
-        self.patches = Patches(config.patch, config.stride, image_size, config.width)
-        layers = config.memory_layers if config.conditioning == "cross" else 0
-        self.layers = nn.ModuleList(EncoderLayer(config, norm_first=True) for _ in range(layers))
+        self.patches = Patches(config, image_size)
+        self.layers = memory_layers(config)
 
     def forward(self, silhouette: Tensor) -> Tensor:
         """(B, H, W) in {0, 1} to (B, C, d)."""
@@ -94,93 +90,58 @@ class Trunk(nn.Module):
     """The denoiser's layers: block tokens that see each other and the silhouette.
 
     Args:
-        config: The denoiser's; `layers` does not count here.
-        layers: How many.
-        conditioned: Whether a vector takes the place of the denoiser's time. Otherwise nothing does, or
-            in `cross`, where it scales and shifts every layer, one that is learned.
+        config: Architecture; its `layers` does not count here.
+        layers: Number of layers.
+        conditioned: Whether a vector is given in place of the denoiser's time. If not, nothing is added in
+            `joint`, and in `cross`, where it scales and shifts every layer, the vector is learned.
     """
 
-    def __init__(self, config: DenoiserConfig, layers: int, conditioned: bool) -> None:
+    def __init__(self, config: TransformerConfig, layers: int, conditioned: bool) -> None:
         super().__init__()
-        self.mask_padding = config.mask_padding
-        self.joint = config.conditioning == "joint"
-        if self.joint:
-            self.layers = nn.ModuleList(EncoderLayer(config) for _ in range(layers))
-        else:
-            self.layers = nn.ModuleList(CrossLayer(config) for _ in range(layers))
-            self.norm = nn.LayerNorm(config.width)
-            if not conditioned:
-                self.condition = nn.Parameter(torch.randn(config.width))
+        self.config = config
+        self.layers = block_layers(config, layers)
+        self.norm = final_norm(config)
+        learned = config.conditioning == "cross" and not conditioned
+        self.condition = nn.Parameter(torch.randn(config.width)) if learned else None
 
     def forward(self, blocks: Tensor, mask: Tensor, memory: Tensor, condition: Tensor | None = None) -> Tensor:
-        """Tokens (B, N, d) for tokens (B, N, d); mask (B, N), condition (B, d).
-
-        Memory is (B, C, d), or (B / n, C, d), serving n consecutive rows each.
-        """
-        if self.joint:
-            if condition is not None:
-                blocks = blocks + condition[:, None]
-            memory = memory.repeat_interleave(len(blocks) // len(memory), 0)
-            tokens = torch.cat([blocks * mask[..., None], memory], dim=1)  # (B, N + C, d), zero vectors as padding
-            seen = F.pad(mask, (0, memory.shape[1]), value=True) if self.mask_padding else None
-            for layer in self.layers:
-                tokens = layer(tokens, seen)
-            return tokens[:, : blocks.shape[1]]
-        vector = self.condition.expand(len(blocks), -1) if condition is None else condition
-        seen = None if bool(mask.all()) else mask
-        for layer in self.layers:
-            blocks = layer(blocks, vector, seen, memory)
-        return self.norm(blocks)
+        """Tokens (B, N, d) for tokens (B, N, d); condition (B, d), mask and memory as in `run_blocks`."""
+        if self.condition is not None:
+            condition = self.condition.expand(len(blocks), -1)
+        tokens = run_blocks(self.layers, self.config, blocks=blocks, mask=mask, memory=memory, condition=condition)
+        return self.norm(tokens)
 
 
-class PoseNetwork(nn.Module):
-    """What Tran-Reg and Tran-VAE have in common: normalisation, order of the blocks, error and sampling.
+class PoseRegressor(PoseNetwork):
+    """What Tran-Reg and Tran-VAE have in common: order of the blocks, error and sampling.
 
     A subclass implements `draw`.
 
     Args:
-        transformer: Architecture, described as the denoiser's.
-        regression: See RegressionConfig.
+        transformer: Architecture, that of the denoiser.
+        regression: How estimated poses are compared with the true ones.
         world: Shapes, size of the silhouette, and N.
 
     Raises:
         StackgenError: If the architecture asks for what only a denoiser has.
     """
 
-    mean: Tensor
-    std: Tensor
-
-    def __init__(
-        self,
-        transformer: DenoiserConfig,
-        regression: RegressionConfig,
-        world: World,
-    ) -> None:
-        super().__init__()
+    def __init__(self, transformer: TransformerConfig, regression: RegressionConfig, world: World) -> None:
+        super().__init__(regression.least_std)
         if transformer.self_conditioning:
             raise StackgenError("self_conditioning: only a denoiser has an earlier estimate to look at")
         self.transformer, self.regression = transformer, regression
         self.blocks = BlockTokens(transformer, world)
         self.silhouette = SilhouetteTokens(transformer, world.grid.image_size)
-        self.head = nn.Linear(transformer.width, POSE)
-        if transformer.conditioning == "cross":
-            nn.init.zeros_(self.head.weight)
-            nn.init.zeros_(self.head.bias)
-        self.register_buffer("mean", torch.zeros(POSE))
-        self.register_buffer("std", torch.ones(POSE))
+        self.head = pose_head(transformer)
 
     @property
     def trims(self) -> bool:
-        """See DenoiserConfig."""
+        """See PoseNetwork."""
         return self.transformer.trims
 
-    def fit_normalization(self, mean: ArrayLike, std: ArrayLike) -> None:
-        """Take over the training poses' statistics (6,) [cell, rad]."""
-        self.mean.copy_(torch.as_tensor(np.asarray(mean)))
-        self.std.copy_(torch.as_tensor(np.asarray(std)).clamp(min=max(self.regression.least_std, 1e-6)))
-
     def scene(self, batch: dict[str, Tensor], generator: torch.Generator | None) -> tuple[Tensor, Tensor, Tensor]:
-        """Shapes (B, N), mask (B, N) and normalised poses (B, N, 6) of a batch, the shapes in random order.
+        """Take shapes (B, N), mask (B, N) and normalised poses (B, N, 6) from a batch, the shapes in random order.
 
         The blocks of one shape keep their order from the bottom up and left to right.
         """
@@ -192,7 +153,7 @@ class PoseNetwork(nn.Module):
         return shapes, mask, (poses - self.mean) / self.std
 
     def error(self, estimate: Tensor, target: Tensor, shapes: Tensor, mask: Tensor) -> Tensor:
-        """(B,) error of normalised poses (B, N, 6), averaged over dimensions and real blocks."""
+        """Compute the error (B,) of normalised poses (B, N, 6), averaged over dimensions and real blocks."""
         if self.regression.assignment == "matched":
             match = best_match(self._distance(estimate[:, :, None], target[:, None]), shapes)
             target = target.gather(1, match[..., None].expand_as(target))
@@ -204,12 +165,12 @@ class PoseNetwork(nn.Module):
         return (difference.square() if self.regression.loss == "squared" else difference.abs()).mean(-1)
 
     def draw(self, shapes: Tensor, mask: Tensor, memory: Tensor, generator: torch.Generator) -> Tensor:
-        """Normalised poses (B, N, 6)."""
+        """Draw normalised poses (B, N, 6) for shapes (B, N), their mask and the silhouette's tokens."""
         raise NotImplementedError
 
     @torch.inference_mode()
     def sample(self, silhouettes: Tensor, shapes: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
-        """Poses (B, N, 6) [cell, rad] for silhouettes (B / n, H, W), each serving n rows of shapes (B, N)."""
+        """See PoseNetwork; the blocks are shown in random order."""
         keys = torch.rand(shapes.shape, generator=generator, device=generator.device).to(shapes.device)
         order = (keys + 2 * ~mask).argsort(-1)  # padding stays last
         poses = self.draw(shapes.gather(1, order), mask.gather(1, order), self.silhouette(silhouettes), generator)
@@ -218,11 +179,11 @@ class PoseNetwork(nn.Module):
 
 
 def shuffled(shapes: Tensor, generator: torch.Generator | None = None) -> Tensor:
-    """(B, N) random order of blocks that are sorted by shape; those of one shape stay in order, padding comes last.
+    """Draw a random order (B, N) of blocks that are sorted by shape; those of one shape stay in order, padding last.
 
     Args:
         shapes: (B, N) sorted, but for the padding at the end, which is negative.
-        generator: The global one by default.
+        generator: Source of the order; the global one by default.
     """
     device = generator.device if generator is not None else shapes.device
     keys = torch.rand(shapes.shape, generator=generator, device=device).to(shapes.device)
@@ -232,11 +193,11 @@ def shuffled(shapes: Tensor, generator: torch.Generator | None = None) -> Tensor
 
 
 def best_match(cost: Tensor, shapes: Tensor) -> Tensor:
-    """(B, N) the target of each block: the permutation within equal shapes that costs least (Kuhn 1955).
+    """Find the target of each block (B, N): the permutation within equal shapes that costs least (Kuhn 1955).
 
     Args:
-        cost: (B, N, N) of giving block i target j.
-        shapes: (B, N) of blocks and of targets.
+        cost: (B, N, N) cost of giving block i target j.
+        shapes: (B, N) shapes of blocks and of targets.
 
     >>> cost = torch.tensor([[[2.0, 1.0, 0.0], [1.0, 5.0, 0.0], [0.0, 0.0, 3.0]]])
     >>> best_match(cost, torch.tensor([[0, 0, 1]])).tolist()
@@ -246,17 +207,3 @@ def best_match(cost: Tensor, shapes: Tensor) -> Tensor:
     costs = torch.where(same, cost.detach(), _FORBIDDEN).double().cpu().numpy()
     found = np.stack([linear_sum_assignment(matrix)[1] for matrix in costs])
     return torch.from_numpy(found).to(shapes.device)
-
-
-class TransformerSampler(NetworkSampler[PoseNetwork]):
-    """A StackSampler: a learned baseline with its world."""
-
-    def sample_batch(
-        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
-    ) -> list[list[Stack]]:
-        """See StackSampler.
-
-        Raises:
-            StackgenError: If a block list is empty or longer than the model takes, or sizes differ.
-        """
-        return self._answer(silhouettes, counts, num_samples, seed, self.model.sample)
