@@ -26,7 +26,7 @@ def main(file: Path, out: Path | None = None, open: bool = False) -> None:
     verdicts = [entry.verdict for entry in content.entries]
     ious = [entry.front_iou for entry in content.entries]
     title = content.silhouette or file.name
-    save_image(picture, contact_sheet(content.target, content.stacks, verdicts, ious, title, grid=content.grid))
+    save_image(picture, contact_sheet(content.target, content.stacks, verdicts, ious, title, grid=content.world.grid))
     write_html(page, content.stacks, verdicts, title)
     print(f"wrote {picture}\nwrote {page}")
     if open:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import numpy as np
 from rich.table import Table
 
-from stackgen.io.stacks_file import Entry
+from stackgen.io.stacks_file import StackEntry
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
 
@@ -20,7 +20,7 @@ def verdict_table(source: str) -> Table:
     return table
 
 
-def add_entries(table: Table, source: str, entries: Iterable[Entry], most: int | None = None) -> None:
+def add_entries(table: Table, source: str, entries: Iterable[StackEntry], most: int | None = None) -> None:
     """One row for each stack, numbered from 1; blocks are numbered from 0, as in the file and the picture.
 
     Args:

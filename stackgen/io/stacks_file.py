@@ -1,7 +1,7 @@
-"""`stacks.json`: the file everything that makes, checks, draws or builds a stack speaks.
+"""`stacks.json`, the file that all commands that make, check, draw or build stacks exchange.
 
 The format is published as a JSON Schema beside this file, `stacks.schema.json`. Only `format` and
-`stacks` must be there; a file written by hand may stop at shapes and positions.
+`stacks` must be there; a file written by hand may stop at shapes and positions, in the paper's world.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask
+from stackgen.world import PAPER_WORLD, Catalogue, Grid, Mask, World
 
 FORMAT = "stackgen.stacks/1"
 SCHEMA_PATH = Path(__file__).with_name("stacks.schema.json")
 MAX_BLOCKS_READ = 1000
-"""Blocks a stack in a file may have; the models' own limit is `MAX_BLOCKS`. The schema says the same."""
+"""Blocks that a stack in a file may have, as the schema says; a model's own limit is its world's `max_blocks`."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +35,8 @@ class Weights:
     """Which weights made the stacks.
 
     Args:
-        name: As given to `stackgen.load`.
-        sha256: Of the file, in hexadecimal.
+        name: Name or path as given to `stackgen.load`.
+        sha256: Checksum of the file, in hexadecimal.
     """
 
     name: str
@@ -44,14 +44,14 @@ class Weights:
 
 
 @dataclass(frozen=True)
-class Entry:
+class StackEntry:
     """One stack of a file and what is known about it.
 
     Args:
-        stack: As sampled or written.
-        verdict: Of a simulation.
-        front_iou: Of the settled stack's front silhouette with the target.
-        comment: For people.
+        stack: The stack as sampled or written.
+        verdict: Verdict of a simulation.
+        front_iou: IoU of the settled stack's front silhouette with the target.
+        comment: Words for people.
     """
 
     stack: Stack
@@ -65,25 +65,23 @@ class StacksFile:
     """All that a `stacks.json` holds.
 
     Args:
-        entries: The stacks, all of one `catalogue`.
-        catalogue: Their shapes.
-        grid: Design grid and scale of the target.
+        entries: The stacks, all of the world's catalogue.
+        world: Shapes of the stacks, design grid and scale of the target; `max_blocks` is not in the file.
         target: (H, W) front silhouette asked for.
         silhouette: File name of the picture it came from.
         block_list: (S,) counts asked for.
-        block_list_source: Whether the network chose them or a person.
-        physics: Of the verdicts, as `Physics.to_json` gives it.
-        seed: Of the sampling.
-        weights: That made the stacks.
-        sampler: The settings they were sampled with.
+        block_list_source: Whether the network chose the block list, or a person gave it.
+        physics: Settings of the simulation behind the verdicts, as `Physics.to_json` gives them.
+        seed: Seed of the sampling.
+        weights: Weights that made the stacks.
+        sampler: Settings that the stacks were sampled with.
         inventory: (S,) counts that the block list was chosen from; None where there was no limit.
         cell_size: Edge of a cube [m].
-        comment: For people.
+        comment: Words for people.
     """
 
-    entries: tuple[Entry, ...]
-    catalogue: Catalogue = PAPER_CATALOGUE
-    grid: Grid = PAPER_GRID
+    entries: tuple[StackEntry, ...]
+    world: World
     target: Mask | None = None
     silhouette: str | None = None
     block_list: NDArray[np.int64] | None = None
@@ -98,7 +96,7 @@ class StacksFile:
 
     @property
     def stacks(self) -> list[Stack]:
-        """The stacks alone."""
+        """The stacks without what is known about them."""
         return [entry.stack for entry in self.entries]
 
 
@@ -121,31 +119,32 @@ def write_stacks(path: str | Path, content: StacksFile) -> None:
     Raises:
         StackgenError: If it cannot be written.
     """
-    write_atomically(path, (_layout(to_json(content)) + "\n").encode())
+    write_atomically(path, (_pretty(to_json(content)) + "\n").encode())
 
 
 def to_json(content: StacksFile) -> dict[str, Any]:
-    """The plain form of a stacks file; what is not known is left out, so that the rest stays readable.
+    """Turn a stacks file into its plain form; what is not known is left out, so that the rest stays readable.
 
     >>> cube = Stack([0], [[0, 0, 0.5, 0, 0, 0]])
-    >>> to_json(StacksFile((Entry(cube),)))["stacks"]
+    >>> to_json(StacksFile((StackEntry(cube),), PAPER_WORLD))["stacks"]
     [{'blocks': [{'shape': 'cube', 'position': [0.0, 0.0, 0.5], 'rotation': [0.0, 0.0, 0.0]}]}]
     """
+    catalogue = content.world.catalogue
     plain = {
         "format": FORMAT,
         "comment": content.comment or None,
         "cell_size_m": float(content.cell_size),
         "silhouette": content.silhouette,
-        "block_list": _counts_to_json(content.block_list, content.catalogue),
+        "block_list": _counts_to_json(content.block_list, catalogue),
         "block_list_source": content.block_list_source,
-        "inventory": _counts_to_json(content.inventory, content.catalogue),
+        "inventory": _counts_to_json(content.inventory, catalogue),
         "seed": None if content.seed is None else int(content.seed),
         "weights": None if content.weights is None else asdict(content.weights),
         "sampler": None if content.sampler is None else dict(content.sampler),
-        "stacks": [_entry_to_json(entry) for entry in content.entries],
+        "stacks": [entry_to_json(entry) for entry in content.entries],
         "physics": None if content.physics is None else dict(content.physics),
-        "grid": asdict(content.grid),
-        "catalogue": content.catalogue.to_json(),
+        "grid": asdict(content.world.grid),
+        "catalogue": catalogue.to_json(),
         "silhouette_packed": None if content.target is None else _pack(content.target),
     }
     return {key: value for key, value in plain.items() if value is not None}
@@ -158,8 +157,8 @@ def from_json(data: Any) -> StacksFile:
         StackgenError: Naming the JSON path of the first thing that is wrong.
     """
     _validate(data)
-    catalogue = Catalogue.from_json(data["catalogue"]) if "catalogue" in data else PAPER_CATALOGUE
-    grid = Grid(**data["grid"]) if "grid" in data else PAPER_GRID
+    world = World.from_json({**PAPER_WORLD.to_json(), **data})
+    catalogue = world.catalogue
     physics = data.get("physics")
     cell_size = float(data.get("cell_size_m", (physics or {}).get("cell_size", 0.05)))
     if physics and not math.isclose(physics.get("cell_size", cell_size), cell_size):
@@ -169,9 +168,8 @@ def from_json(data: Any) -> StacksFile:
     packed, weights = data.get("silhouette_packed"), data.get("weights")
     return StacksFile(
         entries=tuple(_entry_from_json(e, catalogue, f"$.stacks[{i}]") for i, e in enumerate(data["stacks"])),
-        catalogue=catalogue,
-        grid=grid,
-        target=None if packed is None else _unpack(packed, grid),
+        world=world,
+        target=None if packed is None else _unpack(packed, world.grid),
         silhouette=data.get("silhouette"),
         block_list=_counts(data, "block_list", catalogue),
         block_list_source=data.get("block_list_source"),
@@ -210,7 +208,7 @@ _BEGINNING = f'{{"format": "{FORMAT}", "stacks": [...]}}'
 
 
 def _parse(text: str) -> Any:
-    """JSON without the things JSON should not have: NaN, infinities, the same key twice."""
+    """Parse JSON, without what JSON should not have: NaN, infinities, the same key twice."""
 
     def no_constant(name: str) -> NoReturn:
         raise StackgenError(f"holds {name}; every number must be finite")
@@ -255,7 +253,7 @@ def _validate(data: Any) -> None:
 
 
 def _short_message(error: Any) -> str:
-    """What a schema error says, without quoting half of the file."""
+    """Say what a schema error says, without quoting half of the file."""
     message = " ".join(error.message.split())
     quoted = repr(error.instance)
     if len(quoted) > 60:
@@ -271,7 +269,8 @@ def _short(value: Any) -> str:
     return text if len(text) <= 60 else text[:50] + "..."
 
 
-def _entry_to_json(entry: Entry) -> dict[str, Any]:
+def entry_to_json(entry: StackEntry) -> dict[str, Any]:
+    """Turn one stack into its plain form, as it stands under `stacks`."""
     stack, verdict = entry.stack, entry.verdict
     plain: dict[str, Any] = {"comment": entry.comment} if entry.comment else {}
     plain["blocks"] = [{"shape": name, **pose} for name, pose in zip(stack.names, _poses_to_json(stack), strict=True)]
@@ -294,7 +293,7 @@ def _poses_to_json(stack: Stack) -> list[dict[str, list[float]]]:
     return [{"position": pose[:3], "rotation": pose[3:]} for pose in stack.poses.tolist()]
 
 
-def _entry_from_json(item: Mapping[str, Any], catalogue: Catalogue, path: str) -> Entry:
+def _entry_from_json(item: Mapping[str, Any], catalogue: Catalogue, path: str) -> StackEntry:
     shapes = []
     for i, block in enumerate(item["blocks"]):
         if block["shape"] not in catalogue.names:
@@ -304,7 +303,7 @@ def _entry_from_json(item: Mapping[str, Any], catalogue: Catalogue, path: str) -
     stack = Stack(np.array(shapes), _poses_from_json(item["blocks"]), catalogue)
     said = item.get("verdict")
     verdict = None if said is None else _verdict_from_json(said, stack, f"{path}.verdict")
-    return Entry(stack, verdict, item.get("front_iou"), item.get("comment", ""))
+    return StackEntry(stack, verdict, item.get("front_iou"), item.get("comment", ""))
 
 
 def _poses_from_json(items: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:
@@ -312,7 +311,7 @@ def _poses_from_json(items: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:
 
 
 def _verdict_from_json(said: Mapping[str, Any], stack: Stack, path: str) -> Verdict:
-    """The verdict, if it is one about this stack."""
+    """Read a verdict, and see that it is one about this stack."""
     for key in ("drop", "settled"):
         if len(said[key]) != len(stack):
             raise StackgenError(
@@ -330,12 +329,12 @@ def _verdict_from_json(said: Mapping[str, Any], stack: Stack, path: str) -> Verd
 
 
 def _counts_to_json(counts: NDArray[np.int64] | None, catalogue: Catalogue) -> dict[str, int] | None:
-    """Counts (S,) by name, without zeros."""
+    """Turn counts (S,) into counts by name, without zeros."""
     return None if counts is None else {n: int(c) for n, c in zip(catalogue.names, counts, strict=True) if c}
 
 
 def _counts(data: Mapping[str, Any], key: str, catalogue: Catalogue) -> NDArray[np.int64] | None:
-    """(S,) counts that stand under a key."""
+    """Read the counts (S,) that stand under a key."""
     items = data.get(key)
     if items is None:
         return None
@@ -359,7 +358,7 @@ def _unpack(packed: Mapping[str, Any], grid: Grid) -> Mask:
     try:
         data = base64.b64decode(packed["bits"], validate=True)
     except (binascii.Error, ValueError):
-        raise StackgenError("$.silhouette_packed.bits: is not base64; write it anew or leave it out") from None
+        raise StackgenError("$.silhouette_packed.bits: is not base64; write it again or leave it out") from None
     wanted = height * -(-width // 8)
     if len(data) != wanted:
         raise StackgenError(f"$.silhouette_packed.bits: {len(data)} bytes, but {height} x {width} pixels take {wanted}")
@@ -367,10 +366,10 @@ def _unpack(packed: Mapping[str, Any], grid: Grid) -> Mask:
     return np.unpackbits(rows, axis=1, count=width).astype(bool)
 
 
-def _layout(value: Any, indent: int = 0) -> str:
-    """JSON text for people: what fits on a line is on a line.
+def _pretty(value: Any, indent: int = 0) -> str:
+    """Make JSON text for people: what fits on a line is on a line.
 
-    >>> print(_layout({"a": [1, 2]}))
+    >>> print(_pretty({"a": [1, 2]}))
     {"a": [1, 2]}
     """
     line = json.dumps(value, ensure_ascii=False, allow_nan=False)
@@ -378,8 +377,8 @@ def _layout(value: Any, indent: int = 0) -> str:
         return line
     pad = " " * (indent + 1)
     if isinstance(value, dict):
-        inner = [f"{pad}{json.dumps(k, ensure_ascii=False)}: {_layout(v, indent + 1)}" for k, v in value.items()]
+        inner = [f"{pad}{json.dumps(k, ensure_ascii=False)}: {_pretty(v, indent + 1)}" for k, v in value.items()]
     else:
-        inner = [pad + _layout(v, indent + 1) for v in value]
+        inner = [pad + _pretty(v, indent + 1) for v in value]
     opening, closing = "{}" if isinstance(value, dict) else "[]"
     return f"{opening}\n" + ",\n".join(inner) + f"\n{' ' * indent}{closing}"

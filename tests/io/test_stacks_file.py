@@ -18,7 +18,7 @@ from stackgen.geometry import silhouette
 from stackgen.io import files
 from stackgen.io.stacks_file import (
     FORMAT,
-    Entry,
+    StackEntry,
     StacksFile,
     Weights,
     from_json,
@@ -30,7 +30,7 @@ from stackgen.io.stacks_file import (
 from stackgen.protocols import Verdict
 from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
-from stackgen.world import PAPER_CATALOGUE, Catalogue, Grid, Shape
+from stackgen.world import PAPER_CATALOGUE, PAPER_WORLD, Catalogue, Grid, Shape, World
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "stacks"
 
@@ -45,14 +45,13 @@ def full() -> StacksFile:
     verdicts = [None, Verdict(False, fell, rng.normal(size=4), stacks[1].with_poses(rng.normal(size=(4, 6))), False)]
     verdicts.append(Verdict(True, np.zeros(10, bool), np.zeros(10), stacks[2], True, 0.125))
     entries = [
-        Entry(s, v, i, c)
+        StackEntry(s, v, i, c)
         for s, v, i, c in zip(stacks, verdicts, (None, 0.0, 0.875), ("", "é, <b>", "[ 1 ]"), strict=True)
     ]
     return StacksFile(
         tuple(entries),
-        catalogue,
-        grid,
-        silhouette(stacks[2], grid=grid),
+        World(catalogue, grid, 10),
+        silhouette(stacks[2], grid),
         "drawings/arch.png",
         np.array([3, 0, 1, 0, 2]),
         "cnn",
@@ -68,7 +67,7 @@ def full() -> StacksFile:
 
 def same(a: StacksFile, b: StacksFile) -> bool:
     """Equality to the last bit."""
-    return to_json(a) == to_json(b) and (a.target is None) == (b.target is None) and a.catalogue == b.catalogue
+    return to_json(a) == to_json(b) and (a.target is None) == (b.target is None) and a.world == b.world
 
 
 def test_a_full_file_comes_back_to_the_last_bit(tmp_path: Path) -> None:
@@ -77,7 +76,7 @@ def test_a_full_file_comes_back_to_the_last_bit(tmp_path: Path) -> None:
     back = read_stacks(tmp_path / "stacks.json")
     assert same(content, back)
     assert (back.target == content.target).all()  # type: ignore[union-attr]
-    assert back.grid == content.grid
+    assert back.world == content.world
     assert back.weights == content.weights
     assert back.physics == content.physics
     for a, b in zip(content.entries, back.entries, strict=True):
@@ -97,7 +96,7 @@ numbers = st.floats(-1e6, 1e6)
 @given(st.lists(st.tuples(st.integers(0, 3), st.lists(numbers, min_size=6, max_size=6)), min_size=1, max_size=12))
 def test_any_stack_survives_the_round_trip(blocks: list[tuple[int, list[float]]]) -> None:
     stack = Stack(np.array([s for s, _ in blocks]), np.array([p for _, p in blocks]))
-    back = from_json(json.loads(json.dumps(to_json(StacksFile((Entry(stack),))))))
+    back = from_json(json.loads(json.dumps(to_json(StacksFile((StackEntry(stack),), PAPER_WORLD)))))
     assert (back.stacks[0].poses == stack.poses).all()
     assert (back.stacks[0].shapes == stack.shapes).all()
 
@@ -114,7 +113,7 @@ def test_a_file_by_hand_needs_only_the_format_and_the_blocks(tmp_path: Path) -> 
     )
     content = read_stacks(path)
     assert content.stacks[0].poses.tolist() == [[0, 1, 0.5, 0, 0, 0]]
-    assert content.catalogue == PAPER_CATALOGUE
+    assert content.world == PAPER_WORLD
     assert content.cell_size == 0.05
     assert content.entries[0].verdict is None
     assert content.target is None
