@@ -22,9 +22,9 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import iou, silhouette
 from stackgen.stack import Stack
 from stackgen.vision.cameras import Rig, simulated_frame
-from stackgen.vision.depth import capture
+from stackgen.vision.depth import find_structure
 from stackgen.vision.drawings import read_silhouette
-from stackgen.world import Mask
+from stackgen.world import PAPER_GRID, Mask
 
 KINDS = ("as seen", "in cells")
 
@@ -79,7 +79,7 @@ def case(stack: Stack, rng: np.random.Generator, model: Model) -> Case:
     distance, elevation, azimuth = rng.uniform([0.55, 0, -15], [0.9, 25, 15])
     rig = Rig(float(distance), float(elevation), float(azimuth))
     seed = int(rng.integers(2**31))
-    found = capture(simulated_frame(stack, rig, seed=seed))
+    found = find_structure(simulated_frame(stack, rig, seed=seed))
     own = own_silhouette(stack)
     silhouettes = (found.as_seen, found.silhouette)
     best = [model.sample_verified(mask, 1, seed).entries[0] for mask in silhouettes]
@@ -94,7 +94,7 @@ def case(stack: Stack, rng: np.random.Generator, model: Model) -> Case:
 
 def own_silhouette(stack: Stack) -> Mask:
     """(H, W) framed as captured ones are."""
-    return read_silhouette(silhouette(stack), exact=False)
+    return read_silhouette(silhouette(stack, PAPER_GRID), PAPER_GRID, exact=False)
 
 
 def summary(cases: Sequence[Case], kind: int) -> dict[str, Any]:

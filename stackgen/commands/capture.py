@@ -5,37 +5,37 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from stackgen.commands.parsing import Command
 from stackgen.errors import StackgenError
-from stackgen.geometry import iou, silhouette
+from stackgen.geometry import iou
+from stackgen.geometry import silhouette as silhouette_of
 from stackgen.io.files import write_atomically
 from stackgen.io.stacks_file import read_stacks
 from stackgen.stack import format_block_list
+from stackgen.vision.cameras import Rig, realsense_frame, simulated_frame
+from stackgen.vision.cells import Ints
+from stackgen.vision.depth import DepthFrame, Floats, Picture, find_structure, read_frame
 from stackgen.vision.drawings import read_silhouette
-from stackgen.world import PAPER_GRID, Mask
+from stackgen.vision.sketches import read_sketch
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Mask
 
-if TYPE_CHECKING:
-    from stackgen.vision.depth import Frame
-
-Picture = NDArray[np.uint8]
-
-_FOUND = (214, 39, 40)
-_LEFT_OUT = 0.05  # worth telling
+_RED = (214, 39, 40)
+_LEFT_OUT = 0.05
+"""Share of the structure from which on what was left out beside it is worth telling."""
 
 
 @dataclass(frozen=True)
 class _Result:
-    """What is written and printed.
+    """The silhouette that was found, and how it is shown.
 
     Args:
         silhouette: (H, W).
-        overlay: What was seen, with what was found in it.
-        lines: To print.
+        overlay: (h, w, 3) the picture with what was found in it.
+        lines: Lines to print.
     """
 
     silhouette: Mask
@@ -60,147 +60,122 @@ def main(
     truth: Path | None = None,
     overlay: Path | None = None,
 ) -> None:
-    """Find the silhouette of a structure before a depth camera, or in a photo of a drawing.
+    """Find the silhouette of a structure before a depth camera, or in the photo of a drawing.
 
     Args:
-        out: The silhouette to write, PNG; it can be given to `stackgen sample`.
-        depth: A depth frame: a PNG of 16 bits in mm, or a .npy in m.
-        color: The picture of the same pixels, for the overlay.
-        sketch: A photo of a drawing on paper, filled or in outline.
-        simulate: A stacks.json, of which a simulated depth camera sees one stack.
-        stack: Which one, counted from 1.
-        focal: Focal length of the depth frame [pixel]; that of a RealSense D435 by default.
-        elevation: Of the simulated camera above the horizontal [deg].
-        azimuth: Of the simulated camera, to the right of the front [deg].
-        seed: Of the simulated camera's noise.
-        truth: A picture of the structure, to say how well the silhouette fits.
-        overlay: The picture of what was found; by default beside the silhouette.
+        out: PNG to write the silhouette to; `stackgen sample` takes it.
+        depth: Depth frame: a 16-bit PNG in mm, or a .npy in m.
+        color: Picture of the same pixels as --depth, for the overlay.
+        sketch: Photo of a drawing on paper, filled or in outline.
+        simulate: A stacks.json; a simulated depth camera looks at one of its stacks.
+        stack: Number of that stack, counted from 1.
+        focal: Focal length of --depth [pixel]; that of a RealSense D435 by default.
+        elevation: Angle of the simulated camera above the horizontal [deg].
+        azimuth: Angle of the simulated camera to the right of the front [deg].
+        seed: Seed of the simulated camera's noise.
+        truth: Picture of the structure, with which the silhouette is compared.
+        overlay: PNG to write the picture with what was found to; by default it lies beside the silhouette.
     """
-    sources = [bool(depth), bool(sketch), bool(simulate), realsense]
-    if sum(sources) != 1:
+    if sum([bool(depth), bool(sketch), bool(simulate), realsense]) != 1:
         raise StackgenError("give one of --depth FILE, --sketch PHOTO, --simulate STACKS and --realsense")
     if color and not depth:
         raise StackgenError("--color belongs to --depth: give both")
-    expected = None if truth is None else read_silhouette(truth)
+    expected = None if truth is None else read_silhouette(truth, PAPER_GRID)
     if sketch:
         result = _from_sketch(sketch, freehand)
     elif simulate:
-        frame, expected_of_stack = _simulated(simulate, stack, elevation, azimuth, seed)
-        expected = expected_of_stack if expected is None else expected
+        frame, own = _simulated(simulate, stack, elevation, azimuth, seed)
+        expected = own if expected is None else expected
         result = _from_frame(frame, freehand)
     elif depth:
-        from stackgen.vision.depth import read_frame
-
-        result = _from_frame(read_frame(depth, color, focal), freehand, str(depth))
+        result = _from_frame(read_frame(depth, color, focal), freehand, f"{depth}: ")
     else:
-        from stackgen.vision.cameras import realsense_frame
-
         result = _from_frame(realsense_frame(), freehand)
     _write(result, out, overlay or out.with_name(f"{out.stem}-overlay.png"))
     if network:
         from stackgen.api import load
 
         model = load()
-        counts = model.predict_blocks(result.silhouette)
-        print(f"block list by the network: {format_block_list(counts, model.catalogue)}")
+        block_list = model.predict_blocks(result.silhouette)
+        print(f"block list by the network: {format_block_list(block_list, model.world.catalogue)}")
     if expected is not None:
         print(f"IoU with the truth: {iou(result.silhouette, expected):.3f}")
 
 
 def _from_sketch(path: Path, freehand: bool) -> _Result:
-    """The drawing in a photo."""
-    from stackgen.vision.sketches import read_sketch
-
-    found = read_sketch(path)
-    shown = found.drawn if freehand else found.silhouette
-    lines = _made_of(found.cells, found.counts)
-    return _Result(shown, _sketch_overlay(found.photo, found.sheet, shown), lines)
+    """Read the drawing in a photo."""
+    found = read_sketch(path, PAPER_GRID)
+    silhouette = found.drawn if freehand else found.silhouette
+    overlay = _beside(_framed(found.photo, found.sheet), silhouette)
+    return _Result(silhouette, overlay, _made_of(found.cells, found.block_list))
 
 
-def _from_frame(frame: Frame, freehand: bool, name: str = "") -> _Result:
-    """The structure in a frame."""
-    from stackgen.vision.depth import capture
-
+def _from_frame(frame: DepthFrame, freehand: bool, name: str = "") -> _Result:
+    """Find the structure in a frame; `name` begins the line of an error."""
     try:
-        found = capture(frame)
+        found = find_structure(frame, PAPER_GRID)
     except StackgenError as error:
-        raise StackgenError(f"{name}: {error}" if name else str(error)) from error
+        raise StackgenError(f"{name}{error}") from error
     width, height = found.size
-    shown = found.as_seen if freehand else found.silhouette
+    silhouette = found.as_seen if freehand else found.silhouette
     lines = [f"structure: {1e3 * width:.0f} mm wide, {1e3 * height:.0f} mm high"]
     if found.left_out > _LEFT_OUT:
         lines.append(f"left out: what stands beside it and touches it nowhere, {found.left_out:.0%} of its size")
-    lines += _made_of(found.cells, found.counts)
-    return _Result(shown, _frame_overlay(frame, found.seen, found.outline, shown), tuple(lines))
+    shown = _photo(frame)
+    shown[found.seen] = 0.55 * shown[found.seen] + 0.45 * np.array(_RED)
+    overlay = _beside(_framed(shown.astype(np.uint8), found.outline), silhouette)
+    return _Result(silhouette, overlay, (*lines, *_made_of(found.cells, found.block_list)))
 
 
-def _made_of(cells: NDArray[np.int64] | None, counts: NDArray[np.int64] | None) -> tuple[str, ...]:
-    """Lines about the cells that were found."""
+def _made_of(cells: Ints | None, block_list: Ints | None) -> tuple[str, ...]:
+    """Draw the cells that were found in letters, and name their block list."""
     if cells is None:
         return ("not made of whole cells: the silhouette is as seen",)
     drawn = "\n".join("  " + "".join(".#^"[cell] for cell in row) for row in cells[::-1])
-    lines = [f"cells:\n{drawn}"]
-    if counts is not None:
-        lines.append(f"block list by the heuristic: {format_block_list(counts)}")
-    return tuple(lines)
+    if block_list is None:
+        return (f"cells:\n{drawn}",)
+    return f"cells:\n{drawn}", f"block list by the heuristic: {format_block_list(block_list, PAPER_CATALOGUE)}"
 
 
-def _simulated(path: Path, number: int, elevation: float, azimuth: float, seed: int) -> tuple[Frame, Mask]:
-    """What a simulated camera sees of a stack of a file, and the stack's own silhouette."""
-    from stackgen.vision.cameras import Rig, simulated_frame
-
+def _simulated(path: Path, number: int, elevation: float, azimuth: float, seed: int) -> tuple[DepthFrame, Mask]:
+    """Simulate the camera before a stack of a file; return the frame and the stack's own silhouette."""
     content = read_stacks(path)
     if not 1 <= number <= len(content.stacks):
         raise StackgenError(f"{path}: --stack must lie in 1..{len(content.stacks)}, got {number}")
     stack = content.stacks[number - 1]
     frame = simulated_frame(stack, Rig(elevation=elevation, azimuth=azimuth), content.cell_size, seed)
-    return frame, read_silhouette(silhouette(stack, "front", PAPER_GRID, PAPER_GRID.image_size), exact=False)
+    whole = silhouette_of(stack, PAPER_GRID, "front", PAPER_GRID.image_size)
+    return frame, read_silhouette(whole, PAPER_GRID, exact=False)
 
 
-def _frame_overlay(frame: Frame, seen: Mask, outline: NDArray[np.float64], result: Mask) -> Picture:
-    """The frame with the structure's pixels reddened and its front framed; the silhouette beside it."""
+def _photo(frame: DepthFrame) -> Floats:
+    """Return the frame's colours (H, W, 3), or its depth in grey where it has none."""
+    if frame.colour is not None:
+        return frame.colour.astype(np.float64)
     near = np.where(frame.depth > 0, frame.depth, frame.depth.max())
     grey = 255 * (near.max() - near) / max(float(np.ptp(near)), 1e-6)
-    picture = frame.colour if frame.colour is not None else np.repeat(grey[..., None], 3, axis=2)
-    shown = picture.astype(np.float64)
-    shown[seen] = 0.55 * shown[seen] + 0.45 * np.array(_FOUND)
-    return _beside(_framed(shown.astype(np.uint8), outline), result)
+    return np.repeat(grey[..., None], 3, axis=2)
 
 
-def _sketch_overlay(photo: Picture, sheet: NDArray[np.float64], result: Mask) -> Picture:
-    """The photo with the sheet framed; the silhouette beside it."""
-    return _beside(_framed(photo, sheet), result)
-
-
-def _framed(picture: Picture, corners: NDArray[np.float64]) -> Picture:
-    import cv2
-
+def _framed(picture: Picture, corners: Floats) -> Picture:
+    """Draw a red quadrangle into a picture."""
     framed = np.ascontiguousarray(picture)
-    cv2.polylines(framed, [np.round(corners).astype(np.int32)], True, _FOUND, max(1, picture.shape[1] // 300))
+    cv2.polylines(framed, [np.round(corners).astype(np.int32)], True, _RED, max(1, picture.shape[1] // 300))
     return framed
 
 
-def _beside(picture: Picture, result: Mask) -> Picture:
-    """The picture and, as high as it, the silhouette."""
-    import cv2
-
+def _beside(picture: Picture, silhouette: Mask) -> Picture:
+    """Set the silhouette beside a picture, as high as it."""
     height = len(picture)
-    large = cv2.resize(result.astype(np.uint8) * 255, (height, height), interpolation=cv2.INTER_NEAREST)
+    large = cv2.resize(silhouette.astype(np.uint8) * 255, (height, height), interpolation=cv2.INTER_NEAREST)
     return np.concatenate([picture, np.repeat(large[..., None], 3, axis=2)], axis=1)
 
 
 def _write(result: _Result, out: Path, overlay: Path) -> None:
-    """Both pictures, and what was found in words."""
-    write_atomically(out, _png(result.silhouette.astype(np.uint8) * 255))
-    write_atomically(overlay, _png(result.overlay[..., ::-1]))
-    print(*result.lines, sep="\n")
-    print(f"wrote {out}\nwrote {overlay}")
-
-
-def _png(picture: NDArray[np.uint8]) -> bytes:
-    import cv2
-
-    return bytes(cv2.imencode(".png", picture)[1])
+    """Write both pictures, and print what was found."""
+    for path, picture in ((out, result.silhouette.astype(np.uint8) * 255), (overlay, result.overlay[..., ::-1])):
+        write_atomically(path, bytes(cv2.imencode(".png", picture)[1]))
+    print(*result.lines, f"wrote {out}", f"wrote {overlay}", sep="\n")
 
 
 COMMAND = Command(
@@ -213,9 +188,9 @@ COMMAND = Command(
     stackgen capture --realsense --out seen.png
     """,
     flags={
-        "realsense": "Take a frame of the first RealSense camera.",
-        "freehand": "Write what was drawn or seen, not the cells that it is made of.",
-        "network": "Also ask the network for a block list.",
+        "realsense": "Take a frame from the first RealSense camera.",
+        "freehand": "Write the silhouette as drawn or seen, not that of the cells it is made of.",
+        "network": "Also ask the block-list network for a block list.",
     },
 )
 

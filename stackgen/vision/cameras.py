@@ -9,32 +9,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.errors import StackgenError
+from stackgen.errors import StackgenError, require
 from stackgen.geometry import block_vertices
 from stackgen.stack import Stack
-from stackgen.vision.depth import FIELD_OF_VIEW, Frame
-from stackgen.viz.raster import Camera, fill_nearest, prism_faces
-from stackgen.viz.render import shape_colour
+from stackgen.vision.depth import FIELD_OF_VIEW, DepthFrame
+from stackgen.viz.raster import Camera, borders, camera_axes
+from stackgen.viz.render import draw_faces
 
 Floats = NDArray[np.float64]
 
 _WALL = np.array([236.0, 234.0, 228.0])
 _TABLE = np.array([214.0, 205.0, 190.0])
-_LIGHT = np.array([-0.45, -0.65, 0.62])  # towards it, of length 1
+_LIGHT = np.array([-0.45, -0.65, 0.62])  # unit vector towards the light
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Where the simulated camera stands, and how well it sees.
+    """Place and quality of the simulated camera.
 
     Args:
-        distance: From the middle of the structure [m].
-        elevation: Above the horizontal [deg].
-        azimuth: To the right of the front [deg].
-        wall: Behind the middle of the structure [m].
-        size: (width, height) [pixel].
+        distance: Distance from the middle of the structure [m].
+        elevation: Angle above the horizontal [deg].
+        azimuth: Angle to the right of the front [deg].
+        wall: Distance of the wall behind the middle of the structure [m].
+        size: (width, height) of the frame [pixel].
         noise: Standard deviation of a reading at 0.7 m [m]; it grows with the square of the distance.
-        failing: Share of readings beside an edge in depth that fail; half a percent of the others do.
+        failing: Share of the readings beside an edge in depth that fail; half a percent of the others do.
 
     Raises:
         StackgenError: If the camera would stand in the wall, the table or the structure.
@@ -55,17 +55,17 @@ class Rig:
                 f" got {self.elevation:g}, {self.azimuth:g} and {self.distance:g}"
             )
         if not (self.wall > 0.05 and self.noise >= 0 and 0 <= self.failing <= 1 and min(self.size) >= 48):
-            raise StackgenError("rig: the wall must be 0.05 m behind, noise at least 0, failing in 0..1, 48 pixels")
+            raise StackgenError("rig: wall must be over 0.05 m, noise at least 0, failing in 0..1 and size at least 48")
 
 
-def simulated_frame(stack: Stack, rig: Rig = Rig(), cell_size: float = 0.05, seed: int = 0) -> Frame:
-    """What a depth camera sees of a stack on a table before a wall, with the noise of a real one.
+def simulated_frame(stack: Stack, rig: Rig = Rig(), cell_size: float = 0.05, seed: int = 0) -> DepthFrame:
+    """Simulate what a depth camera sees of a stack on a table before a wall, with the noise of a real one.
 
     Args:
-        stack: In the world frame.
+        stack: The stack, in the world frame.
         rig: Place and quality of the camera.
         cell_size: Edge of a cube [m].
-        seed: Of the noise.
+        seed: Seed of the noise.
 
     >>> frame = simulated_frame(Stack([0], [[0, 0, 0.5, 0, 0, 0]]), Rig(elevation=0, noise=0, failing=0))
     >>> round(float(np.median(frame.depth[270:300, 310:330])), 3)  # the front of the cube is half a cell nearer
@@ -75,35 +75,27 @@ def simulated_frame(stack: Stack, rig: Rig = Rig(), cell_size: float = 0.05, see
     width, height = rig.size
     camera = _camera(rig, cell_size)
     nearest, colours = _background(camera, rig, cell_size)
-    numbers = np.zeros((height, width), dtype=np.int32)
-    shades = [np.zeros(3)]
-    for index, corners in zip(stack.shapes, block_vertices(stack), strict=True):
-        for face in prism_faces(stack.catalogue[index]):
-            polygon = corners[face]
-            normal = np.cross(polygon[1] - polygon[0], polygon[2] - polygon[0])
-            if (camera.eye - polygon[0]) @ normal <= 0:
-                continue
-            fill_nearest(numbers, nearest, len(shades), *camera.project(polygon))
-            lit = 0.62 + 0.4 * max(0.0, float(normal @ _LIGHT) / float(np.linalg.norm(normal)))
-            shades.append(np.array(shape_colour(index)) * lit)
-    colours = np.where(numbers[..., None] > 0, np.array(shades)[numbers], colours)
+    faces = draw_faces(stack, block_vertices(stack), camera, nearest, _shade)
+    colours = np.where(faces.seen[..., None] > 0, faces.colours[faces.seen], colours)
     depth = _as_measured(cell_size / nearest.astype(np.float64), rig, rng)
-    return Frame(depth, _as_photographed(colours, rng), camera.scale, (width / 2, height / 2))
+    return DepthFrame(depth, _as_photographed(colours, rng), camera.scale, (width / 2, height / 2))
+
+
+def _shade(base: Floats, normal: Floats) -> Floats:
+    """Shade a face in the light of a lamp."""
+    return base * (0.62 + 0.4 * max(0.0, float(normal @ _LIGHT)))
 
 
 def _camera(rig: Rig, cell_size: float) -> Camera:
-    """It looks at the middle of the design grid, two cells up, or as high as lets it see the table."""
-    azimuth, elevation = math.radians(rig.azimuth), math.radians(rig.elevation)
-    level = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
-    back = level * math.cos(elevation) + np.array([0, 0, math.sin(elevation)])
-    right = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
+    """Place the camera: it looks at the middle of the design grid, two cells up."""
+    right, up, back = camera_axes(math.radians(rig.azimuth), math.radians(rig.elevation))
     focal = rig.size[0] / 2 / math.tan(math.radians(FIELD_OF_VIEW / 2))
     eye = np.array([0, 0, 2.0]) + back * rig.distance / cell_size
-    return Camera(right, np.cross(back, right), back, eye, focal, np.array(rig.size) / 2)
+    return Camera(right, up, back, eye, focal, np.array(rig.size) / 2)
 
 
 def _background(camera: Camera, rig: Rig, cell_size: float) -> tuple[NDArray[np.float32], Floats]:
-    """(H, W) nearness of wall and table [1/cell], and (H, W, 3) their colours."""
+    """Return the nearness (H, W) of wall and table [1/cell] and their colours (H, W, 3)."""
     width, height = rig.size
     rows, columns = np.mgrid[:height, :width] + 0.5
     x, y = (columns - camera.center[0]) / camera.scale, (camera.center[1] - rows) / camera.scale
@@ -117,47 +109,35 @@ def _background(camera: Camera, rig: Rig, cell_size: float) -> tuple[NDArray[np.
 
 
 def _as_measured(depth: Floats, rig: Rig, rng: np.random.Generator) -> Floats:
-    """(H, W) readings in whole millimetres: noisy, and failing here and there, more so beside edges."""
+    """Return readings (H, W) in whole millimetres: noisy, and failing here and there, more so beside edges."""
     if not rig.noise and not rig.failing:
         return depth
     noisy = depth + rng.normal(0, rig.noise, depth.shape) * (depth / 0.7) ** 2
-    edge = np.zeros(depth.shape, dtype=bool)
-    across, down = np.abs(np.diff(depth, axis=1)) > 0.03, np.abs(np.diff(depth, axis=0)) > 0.03
-    edge[:, 1:] |= across
-    edge[:, :-1] |= across
-    edge[1:] |= down
-    edge[:-1] |= down
+    edge = borders(depth, 0.03)
     failed = rng.random(depth.shape) < np.where(edge, rig.failing, 0.005 * bool(rig.failing))
     return np.where(failed, 0, np.round(noisy, 3))
 
 
 def _as_photographed(colours: Floats, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """(H, W, 3) softened by the lens and with the grain of a sensor."""
+    """Soften colours (H, W, 3) as a lens does, and add the grain of a sensor."""
     from scipy import ndimage
 
     soft = ndimage.gaussian_filter(colours, (0.8, 0.8, 0))
     return np.clip(np.round(soft + rng.normal(0, 3, colours.shape)), 0, 255).astype(np.uint8)
 
 
-def realsense_frame(timeout: float = 5.0, skipped: int = 15) -> Frame:
-    """One frame of the first RealSense camera, its depth aligned to its colours.
+def realsense_frame(timeout: float = 5.0, skipped: int = 15) -> DepthFrame:
+    """Take one frame of the first RealSense camera, its depth aligned to its colours.
 
     Args:
-        timeout: For each frame [s].
-        skipped: Frames until exposure has settled.
+        timeout: Longest wait for each frame [s].
+        skipped: Number of frames until exposure has settled.
 
     Raises:
         StackgenError: If the package or the camera is missing, or the camera sends nothing.
     """
-    try:
-        import pyrealsense2 as realsense
-    except ImportError as error:
-        reason = "" if isinstance(error, ModuleNotFoundError) else f" ({error})"
-        raise StackgenError(
-            f"a RealSense camera needs the package pyrealsense2{reason}: pip install 'stackgen[realsense]'"
-        ) from error
-    pipeline: Any = realsense.pipeline()
-    settings: Any = realsense.config()
+    realsense: Any = require("pyrealsense2", "realsense")
+    pipeline, settings = realsense.pipeline(), realsense.config()
     settings.enable_stream(realsense.stream.depth, 640, 480, realsense.format.z16, 30)
     settings.enable_stream(realsense.stream.color, 640, 480, realsense.format.rgb8, 30)
     try:
@@ -172,7 +152,7 @@ def realsense_frame(timeout: float = 5.0, skipped: int = 15) -> Frame:
         lens = colour.profile.as_video_stream_profile().intrinsics
         unit = profile.get_device().first_depth_sensor().get_depth_scale()
         values = np.asarray(depth.get_data(), dtype=np.float64) * unit
-        return Frame(values, np.array(colour.get_data(), dtype=np.uint8), lens.fx, (lens.ppx, lens.ppy))
+        return DepthFrame(values, np.array(colour.get_data(), dtype=np.uint8), lens.fx, (lens.ppx, lens.ppy))
     except RuntimeError as error:
         raise StackgenError(f"the RealSense camera sends nothing ({error}): unplug it and plug it in again") from error
     finally:

@@ -5,44 +5,51 @@ Legend: H x W pixels, rows and columns of cells from the lower left, S shapes.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.geometry import iou
 from stackgen.vision.drawings import grid_offset, read_silhouette
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Grid, Mask
+from stackgen.vision.masks import bounding_box
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, Grid, Mask
 
 Ints = NDArray[np.int64]
 
 EMPTY, FULL, TRIANGLE = range(3)
-"""What a cell may be."""
+"""The kinds of cells."""
 
 NEAR = 0.3
-"""How far from whole numbers the sides of what is made of whole cells may be [cell]."""
+"""The sides of a structure of whole cells are at most this far from whole numbers [cell]."""
 
 
-def in_cells(silhouette: Mask, alike: float, grid: Grid = PAPER_GRID) -> tuple[Ints, Mask] | None:
-    """What each cell is, and the silhouette (H, W) that those cells make; None if it is not made of whole cells.
+def in_cells(as_read: Mask, alike: float, grid: Grid) -> tuple[Mask, Ints | None, Ints | None]:
+    """Replace a silhouette by that of the cells it is made of, where it is made of whole cells.
 
     Args:
-        silhouette: (H, W) on the grid, anywhere between its cell lines, not empty.
-        alike: IoU of the two, the first `stretched`, from which on it is taken to be made of whole cells.
-        grid: Of both.
+        as_read: (H, W) silhouette on the grid, anywhere between its cell lines, not empty.
+        alike: Least IoU of the cells' picture with the stretched silhouette for it to count as made of whole cells.
+        grid: Grid of the silhouette.
+
+    Returns:
+        (H, W) silhouette, (rows, columns) cells and (S,) block list; without whole cells `as_read`, None and None.
     """
-    picture = stretched(silhouette, grid)
+    picture = stretched(as_read, grid)
     cells = occupancy(picture, grid)
     whole = picture_of(cells, grid)
-    return (cells, read_silhouette(whole, grid, exact=False)) if iou(whole, picture) >= alike else None
+    if iou(whole, picture) < alike:
+        return as_read, None, None
+    return read_silhouette(whole, grid, exact=False), cells, block_list_of(cells)
 
 
-def stretched(silhouette: Mask, grid: Grid = PAPER_GRID) -> Mask:
-    """The silhouette (H, W), its box stretched to whole cells where nearly so, its edges on the grid's cell lines.
+def stretched(silhouette: Mask, grid: Grid) -> Mask:
+    """Stretch the box of a silhouette (H, W) to whole cells where nearly so, and set its edges on the cell lines.
 
     Where a block sticks out, what was scaled to fit its width is too low, and half a cell looks like a triangle.
     """
-    rows, columns = np.flatnonzero(silhouette.any(axis=1)), np.flatnonzero(silhouette.any(axis=0))
-    cut = silhouette[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    cut = silhouette[bounding_box(silhouette)]
     size = np.array(cut.shape) / grid.pixels_per_cell
     near = np.maximum(np.round(size), 1)
     height, width = np.round(np.where(np.abs(size - near) < NEAR, near, size) * grid.pixels_per_cell).astype(int)
@@ -53,26 +60,23 @@ def stretched(silhouette: Mask, grid: Grid = PAPER_GRID) -> Mask:
     return np.roll(picture, grid_offset(picture, grid), axis=1)
 
 
-def occupancy(silhouette: Mask, grid: Grid = PAPER_GRID) -> Ints:
-    """(height, width) what each cell of the grid is: of full, empty and triangle what it differs from least.
+def occupancy(silhouette: Mask, grid: Grid) -> Ints:
+    """Find the kind (height, width) of each cell of the grid: the one that it differs from least.
 
     A triangle has nothing on top of it.
 
     >>> picture = np.zeros((64, 64), dtype=bool)
     >>> picture[46:60, 4:32] = True
-    >>> occupancy(picture)[0].tolist()
+    >>> occupancy(picture, Grid())[0].tolist()
     [1, 1, 0, 0]
     """
-    patterns = {
-        kind: picture_of(np.full((1, 1), kind), Grid(1, 1, grid.image_size, grid.pixels_per_cell, grid.ground_margin))
-        for kind in (EMPTY, FULL, TRIANGLE)
-    }
+    one = replace(grid, width=1, height=1)
+    patterns = {kind: picture_of(np.full((1, 1), kind), one)[_window(one, 0, 0)] for kind in (EMPTY, FULL, TRIANGLE)}
     cells = np.zeros((grid.height, grid.width), dtype=np.int64)
     for row in reversed(range(grid.height)):
         for column in range(grid.width):
-            window = _window(grid, row, column)
-            middle = _window(Grid(1, 1, grid.image_size, grid.pixels_per_cell, grid.ground_margin), 0, 0)
-            wrong = {kind: np.count_nonzero(silhouette[window] != p[middle]) for kind, p in patterns.items()}
+            seen = silhouette[_window(grid, row, column)]
+            wrong = {kind: np.count_nonzero(seen != pattern) for kind, pattern in patterns.items()}
             if row + 1 < grid.height and cells[row + 1, column] != EMPTY:
                 del wrong[TRIANGLE]
             cells[row, column] = min(wrong, key=lambda kind: wrong[kind])
@@ -87,8 +91,8 @@ def _window(grid: Grid, row: int, column: int) -> tuple[slice, slice]:
     return slice(round(bottom - scale), round(bottom)), slice(round(left), round(left + scale))
 
 
-def picture_of(cells: Ints, grid: Grid = PAPER_GRID) -> Mask:
-    """(H, W) silhouette of cells (rows, columns)."""
+def picture_of(cells: Ints, grid: Grid) -> Mask:
+    """Draw the silhouette (H, W) of cells (rows, columns)."""
     picture = np.zeros((grid.image_size,) * 2, dtype=bool)
     x, z = grid.horizontal(), grid.vertical("front")[:, None]
     for row, column in np.argwhere(cells != EMPTY):
@@ -99,18 +103,20 @@ def picture_of(cells: Ints, grid: Grid = PAPER_GRID) -> Mask:
     return picture
 
 
-def block_list(cells: Ints) -> Ints | None:
-    """(S,) counts: each run of full cells is covered with the longest blocks that fit; None if that takes too many.
+def block_list_of(cells: Ints) -> Ints | None:
+    """Guess the block list (S,) of the paper's shapes; None if it would be empty or longer than the paper's stacks.
 
-    >>> block_list(np.array([[1, 1, 1, 1], [0, 1, 2, 0]])).tolist()
+    Each run of full cells is covered with the longest blocks that fit.
+
+    >>> block_list_of(np.array([[1, 1, 1, 1], [0, 1, 2, 0]])).tolist()
     [2, 0, 1, 1]
     """
-    counts = np.zeros(len(PAPER_CATALOGUE), dtype=np.int64)
-    counts[PAPER_CATALOGUE.index("triangle")] = np.count_nonzero(cells == TRIANGLE)
+    block_list = np.zeros(len(PAPER_CATALOGUE), dtype=np.int64)
+    block_list[PAPER_CATALOGUE.index("triangle")] = np.count_nonzero(cells == TRIANGLE)
     for row in np.pad((cells == FULL).astype(int), ((0, 0), (1, 1))):
         starts, ends = np.flatnonzero(np.diff(row) == 1), np.flatnonzero(np.diff(row) == -1)
         for length in ends - starts:
             for name, size in (("long_rectangle", 3), ("rectangle", 2), ("cube", 1)):
-                counts[PAPER_CATALOGUE.index(name)] += length // size
+                block_list[PAPER_CATALOGUE.index(name)] += length // size
                 length %= size
-    return counts if 1 <= counts.sum() <= MAX_BLOCKS else None
+    return block_list if 1 <= block_list.sum() <= MAX_BLOCKS else None

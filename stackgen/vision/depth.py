@@ -16,19 +16,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.vision.cells import Ints, block_list, in_cells
-from stackgen.vision.drawings import read_silhouette
-from stackgen.world import PAPER_GRID, Grid, Mask
+from stackgen.vision.cells import Ints, in_cells
+from stackgen.vision.drawings import Picture, read_picture, read_silhouette
+from stackgen.vision.masks import bounding_box, largest, smoothed
+from stackgen.world import Grid, Mask
 
 Floats = NDArray[np.float64]
-Picture = NDArray[np.uint8]
 
 FIELD_OF_VIEW = 69.4
-"""Horizontal, of the colour camera of a RealSense D435 [deg]; depth frames aligned to it have it, too."""
+"""Horizontal angle of the colour camera of a RealSense D435 and of depth frames aligned to it [deg]."""
 
 FAR = 4.0
 """Depth readings beyond this are no readings [m]."""
@@ -46,25 +47,28 @@ PIXEL = 0.002
 """Edge of a pixel of the picture of the front [m]."""
 
 MEDIAN = 5
-"""Of the filter on the picture of the front [pixel]: it smooths what depth noise does to edges."""
+"""Size of the median filter on frame and front [pixel]: it smooths what depth noise does to edges."""
 
 JOINT = 0.010
 """Parts of the structure nearer than this belong together [m]: between blocks side by side depth often fails."""
 
 ALIKE = 0.85
-"""IoU with the silhouette as seen, stretched, from which on the structure is taken to be made of whole cells."""
+"""Least IoU with the stretched silhouette for the structure to count as made of whole cells."""
 
 _EDGE = 0.12
 """Width of the strip along the picture's edge in which wall and table are looked for [share]."""
 
+_DTYPES = (np.uint16, np.int32, np.int64, np.float32, np.float64)
+"""Kinds of numbers that a depth file may hold."""
+
 
 @dataclass(frozen=True)
-class Frame:
-    """What a depth camera delivers.
+class DepthFrame:
+    """One picture of a depth camera.
 
     Args:
         depth: (H, W) along the optical axis [m]; 0 or nan where there is no reading.
-        colour: (H, W, 3) seen by the same pixels; None without.
+        colour: (H, W, 3) colours seen by the same pixels, or None.
         focal: Focal length [pixel]; None for the one of `FIELD_OF_VIEW`.
         center: (column, row) of the optical axis [pixel]; None for the middle.
 
@@ -103,35 +107,34 @@ class Frame:
         return focal, column, row
 
     def points(self) -> Floats:
-        """(H, W, 3) of each pixel in the camera frame [m]; the origin where there is no reading."""
+        """Return the point (H, W, 3) of each pixel in the camera frame [m]; the origin where there is no reading."""
         focal, column, row = self.camera
         rows, columns = np.mgrid[: self.depth.shape[0], : self.depth.shape[1]] + 0.5
-        return (
-            np.stack([(columns - column) / focal, (rows - row) / focal, np.ones_like(rows)], -1) * self.depth[..., None]
-        )
+        rays = np.stack([(columns - column) / focal, (rows - row) / focal, np.ones_like(rows)], -1)
+        return rays * self.depth[..., None]
 
 
 @dataclass(frozen=True)
-class Capture:
-    """What was found in a frame.
+class SeenStructure:
+    """The structure that was found in a depth frame.
 
     Args:
         silhouette: (H, W) on the grid: that of the cells where the structure is made of whole cells, else as seen.
-        as_seen: (H, W) on the grid.
-        cells: (rows, columns) empty, full or triangle, the first row on the ground; None where it is not made of
-            whole cells.
-        counts: (S,) block list by the heuristic; None without cells, or with too many.
+        as_seen: (H, W) on the grid, as seen.
+        cells: (rows, columns) EMPTY, FULL or TRIANGLE, the first row on the ground; None where the structure is not
+            made of whole cells.
+        block_list: (S,) block list guessed from the cells; None without cells, or with too many.
         seen: (H, W) of the frame: pixels of the structure.
         front: (h, w) the structure's front as seen straight on, `PIXEL` a pixel.
         outline: (4, 2) corners of that picture in the frame [pixel], from the upper left clockwise.
         size: Width and height of the structure [m].
-        left_out: What stands beside it and touches it nowhere, as a share of it.
+        left_out: What stands beside the structure and touches it nowhere, as a share of it.
     """
 
     silhouette: Mask
     as_seen: Mask
     cells: Ints | None
-    counts: Ints | None
+    block_list: Ints | None
     seen: Mask
     front: Mask
     outline: Floats
@@ -139,57 +142,54 @@ class Capture:
     left_out: float
 
 
-def capture(frame: Frame, grid: Grid = PAPER_GRID) -> Capture:
-    """The silhouette of the structure in a frame.
+def find_structure(frame: DepthFrame, grid: Grid) -> SeenStructure:
+    """Find the structure in a depth frame, and its silhouette.
 
     Args:
-        frame: From a camera in front of the structure.
+        frame: Frame of a camera in front of the structure.
         grid: Scale and place of the silhouette.
 
     Raises:
-        StackgenError: If nothing stands in front of the background.
+        StackgenError: If nothing stands in front of the background, or the structure has no plane front.
     """
     planes = _background(frame)
-    foreground = _median(in_front(frame, planes), 5) & (frame.depth > 0)
+    foreground = smoothed(in_front(frame, planes), MEDIAN) & (frame.depth > 0)
     if foreground.mean() < 5e-4:
         raise StackgenError(
             f"nothing stands in front of the background: no block is nearer than it by {1e3 * IN_FRONT:g} mm"
         )
-    seen = largest(foreground, round(_pixels(frame, foreground, JOINT)))
+    pixels_per_metre = frame.camera[0] / float(np.median(frame.depth[foreground]))
+    seen = largest(foreground, round(JOINT * pixels_per_metre))
     picture, outline = _straight_on(frame, seen, planes)
-    front = largest(_median(picture, MEDIAN), round(JOINT / PIXEL))
-    rows, columns = np.flatnonzero(front.any(axis=1)), np.flatnonzero(front.any(axis=0))
-    size = (float(np.ptp(columns) + 1) * PIXEL, float(np.ptp(rows) + 1) * PIXEL)
+    front = largest(smoothed(picture, MEDIAN), round(JOINT / PIXEL))
+    rows, columns = bounding_box(front)
+    size = ((columns.stop - columns.start) * PIXEL, (rows.stop - rows.start) * PIXEL)
     as_seen = read_silhouette(front, grid, exact=False)
-    cells, silhouette = in_cells(as_seen, ALIKE, grid) or (None, as_seen)
-    counts = None if cells is None else block_list(cells)
+    silhouette, cells, block_list = in_cells(as_seen, ALIKE, grid)
     left_out = np.count_nonzero(foreground & ~seen) / np.count_nonzero(seen)
-    return Capture(silhouette, as_seen, cells, counts, seen, front, outline, size, left_out)
+    return SeenStructure(silhouette, as_seen, cells, block_list, seen, front, outline, size, left_out)
 
 
-def read_frame(depth: str | Path, colour: str | Path | None = None, focal: float | None = None) -> Frame:
-    """A frame from files.
+def read_frame(depth: str | Path, colour: str | Path | None = None, focal: float | None = None) -> DepthFrame:
+    """Read a depth frame from files.
 
     Args:
         depth: A .npy of floats [m] or of whole numbers [mm], or a PNG of 16 bits [mm].
-        colour: The picture of the same pixels.
-        focal: Focal length [pixel]; that of a RealSense by default.
+        colour: Picture of the same pixels, or None.
+        focal: Focal length [pixel]; that of a RealSense D435 by default.
 
     Raises:
         StackgenError: If a file is missing or something else, or has no depth.
     """
+    values, picture = _read_depth(Path(depth)), None if colour is None else read_picture(colour)
     try:
-        return Frame(_read_depth(Path(depth)), None if colour is None else read_picture(colour), focal)
+        return DepthFrame(values, picture, focal)
     except StackgenError as error:
-        raise (
-            error if str(error).startswith((str(depth), str(colour))) else StackgenError(f"{depth}: {error}")
-        ) from error
+        raise StackgenError(f"{depth}: {error}") from error
 
 
 def is_depth(path: str | Path) -> bool:
-    """Whether a file is a depth frame rather than a picture: a .npy, or an image of one channel of 16 bits."""
-    import cv2
-
+    """Tell whether a file is a depth frame rather than a picture: a .npy, or an image of one channel of 16 bits."""
     path = Path(path)
     if path.suffix == ".npy" or not path.is_file():
         return path.suffix == ".npy"
@@ -198,8 +198,7 @@ def is_depth(path: str | Path) -> bool:
 
 
 def _read_depth(path: Path) -> Floats:
-    import cv2
-
+    """Read depths (H, W) [m]."""
     try:
         data = path.read_bytes()
         if path.suffix == ".npy":
@@ -209,39 +208,17 @@ def _read_depth(path: Path) -> Floats:
     except (OSError, ValueError, EOFError, cv2.error) as error:
         reason = getattr(error, "strerror", None) or "it is no array of numbers"
         raise StackgenError(f"{path}: cannot be read: {reason}") from error
-    if (
-        values is None
-        or values.ndim != 2
-        or values.dtype not in (np.uint16, np.int32, np.int64, np.float32, np.float64)
-    ):
+    if values is None or values.ndim != 2 or values.dtype not in _DTYPES:
         raise StackgenError(f"{path}: is no depth frame; give a 16-bit PNG in mm, or a .npy (H, W) in m or whole mm")
     return values.astype(np.float64) / (1 if values.dtype.kind == "f" else 1000)
 
 
-def read_picture(path: str | Path) -> Picture:
-    """A colour picture (H, W, 3), upright.
-
-    Raises:
-        StackgenError: If there is none.
-    """
-    import cv2
-
-    try:
-        data = np.frombuffer(Path(path).read_bytes(), np.uint8)
-    except OSError as error:
-        raise StackgenError(f"{path}: cannot be read: {error.strerror}") from error
-    picture = cv2.imdecode(data, cv2.IMREAD_COLOR) if len(data) else None
-    if picture is None:
-        raise StackgenError(f"{path}: is not an image that can be read; give a PNG or JPEG file")
-    return np.ascontiguousarray(picture[..., ::-1])
-
-
-def in_front(frame: Frame, planes: Sequence[Floats | None]) -> Mask:
-    """(H, W) pixels whose points are on this side of wall and table, and not too near to them.
+def in_front(frame: DepthFrame, planes: Sequence[Floats | None]) -> Mask:
+    """Find the pixels (H, W) whose points are on this side of wall and table, and not too near to them.
 
     Args:
         frame: H x W pixels.
-        planes: (3,) n of each plane n p = 1 [1/m], the wall's and the table's; None where there is none.
+        planes: (3,) n of the wall's and the table's plane n p = 1 [1/m]; None where there is none.
     """
     found = frame.depth > 0
     points = frame.points()
@@ -251,18 +228,18 @@ def in_front(frame: Frame, planes: Sequence[Floats | None]) -> Mask:
     return np.asarray(found)
 
 
-def _background(frame: Frame) -> tuple[Floats | None, Floats | None]:
-    """The planes of the wall and of the table.
+def _background(frame: DepthFrame) -> tuple[Floats | None, Floats | None]:
+    """Find the planes of the wall and of the table.
 
-    The wall's has most of the readings along the upper edge and the upper halves of the others, the table's most of
-    those in the rest of the strip that lie before the wall. Either may be out of sight: the table is to a camera at
-    its height.
+    The wall has most of the readings along the upper edge and the upper halves of the others, the table most of
+    those in the rest of the strip that lie before the wall. Either may be out of sight: a camera at the table's height
+    does not see it.
     """
     height, width = frame.depth.shape
-    rows, columns = np.mgrid[:height, :width]
     band_y, band_x = round(_EDGE * height), round(_EDGE * width)
-    edge = (rows < band_y) | (rows >= height - band_y) | (columns < band_x) | (columns >= width - band_x)
-    strip, above = edge & (frame.depth > 0), rows < height // 2
+    strip = frame.depth > 0
+    strip[band_y : height - band_y, band_x : width - band_x] = False
+    above = np.arange(height)[:, None] < height // 2
     points = frame.points()
     wall = _plane_of_most(points[strip & above])
     rest = strip & ~above
@@ -273,10 +250,10 @@ def _background(frame: Frame) -> tuple[Floats | None, Floats | None]:
 
 
 def _plane_of_most(points: Floats, tolerance: float = 0.012, rounds: int = 200) -> Floats | None:
-    """n (3,) of the plane n p = 1 through most of the points (n, 3), None if it meets fewer than a third.
+    """Find n (3,) of the plane n p = 1 through most of the points (n, 3), None if it meets fewer than a third.
 
-    Searched among planes through three of them (RANSAC), then fitted to all those that lie in it. What is fitted is
-    1 / z, which is linear in x / z and y / z: that does not favour what is far away.
+    The plane is searched among those through three points (RANSAC), then fitted to all points that lie in it. What is
+    fitted is 1 / z, which is linear in x / z and y / z: that does not favour what is far away.
     """
     if len(points) < 50:
         return None
@@ -296,13 +273,11 @@ def _plane_of_most(points: Floats, tolerance: float = 0.012, rounds: int = 200) 
     return np.asarray(np.linalg.lstsq(terms[fits], values[fits], rcond=None)[0])
 
 
-def _straight_on(frame: Frame, seen: Mask, planes: tuple[Floats | None, Floats | None]) -> tuple[Mask, Floats]:
-    """The structure as seen straight on from far away, and the corners (4, 2) of that picture in the frame.
+def _straight_on(frame: DepthFrame, seen: Mask, planes: tuple[Floats | None, Floats | None]) -> tuple[Mask, Floats]:
+    """Draw the structure as seen straight on from far away, and find that picture's corners (4, 2) in the frame.
 
     Its points are projected along the normal of its front: tops and sides of blocks fall on the edges of their fronts.
     """
-    import cv2
-
     points = frame.points()[seen]
     plane = _plane_of_most(points)
     if plane is None:
@@ -331,7 +306,7 @@ def _straight_on(frame: Frame, seen: Mask, planes: tuple[Floats | None, Floats |
 
 
 def _axes(front: Floats, table: Floats | None) -> tuple[Floats, Floats]:
-    """Unit vectors to the right and upwards in the front; upright is what the table says, else the camera."""
+    """Return unit vectors to the right and upwards in the front; the table tells what is upright, else the camera."""
     away = front / np.linalg.norm(front)
     right = np.cross(table, away) if table is not None else np.array([1.0, 0, 0])
     right = right - (right @ away) * away
@@ -345,30 +320,3 @@ def _down_to(picture: Picture, ground: int) -> None:
     if 0 < top < ground <= len(picture):
         picture[top:ground] |= picture[top - 1]
         picture[ground:] = 0
-
-
-def largest(mask: Mask, gap: int) -> Mask:
-    """The largest component of a mask; parts at most `gap` pixels apart are one component.
-
-    >>> largest(np.array([[1, 1, 0, 0, 0, 1]], dtype=bool), 1).tolist()
-    [[True, True, False, False, False, False]]
-    """
-    import cv2
-
-    radius = max(0, gap // 2)
-    kernel = np.ones((2 * radius + 1,) * 2, np.uint8)
-    _, labels = cv2.connectedComponents(cv2.dilate(mask.astype(np.uint8), kernel))
-    areas = np.bincount(labels[mask], minlength=1)
-    areas[0] = 0
-    return np.asarray(mask & (labels == areas.argmax()))
-
-
-def _median(mask: Mask, size: int) -> Mask:
-    import cv2
-
-    return np.asarray(cv2.medianBlur(mask.astype(np.uint8) * 255, size) > 0)
-
-
-def _pixels(frame: Frame, seen: Mask, length: float) -> float:
-    """How many pixels of the frame a length is at the structure's depth."""
-    return length * frame.camera[0] / float(np.median(frame.depth[seen]))

@@ -1,4 +1,4 @@
-"""Any picture of a structure to the silhouette the models know.
+"""From any picture of a structure to the silhouette that the models know.
 
 The structure is whatever differs from the background, and the background is what lies along the
 picture's edge. So polarity, colours and paper do not matter, and nothing has to be declared.
@@ -15,12 +15,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.vision.masks import bounding_box, components
-from stackgen.world import PAPER_GRID, Grid, Mask
+from stackgen.world import Grid, Mask
 
 if TYPE_CHECKING:
     from PIL.Image import Image
 
 Levels = NDArray[np.float32]
+Picture = NDArray[np.uint8]
 
 _WORK_SIZE = 768  # longer edge [pixel] every picture is brought to, so that edges are found to a fraction of a pixel
 _SMALLEST = 8  # [pixel], of the picture and of the structure in it
@@ -29,8 +30,8 @@ _CONTRAST = 20.0  # the least difference from the background that counts [of 255
 _EDGE_BAND = 0.02  # width of the strip along the edge that shows the background [of the shorter edge]
 
 
-def read_silhouette(source: str | Path | ArrayLike, grid: Grid = PAPER_GRID, exact: bool | None = None) -> Mask:
-    """The front silhouette (H, W) in a picture, scaled and placed as the grid wants it.
+def read_silhouette(source: str | Path | ArrayLike, grid: Grid, exact: bool | None = None) -> Mask:
+    """Read the front silhouette (H, W) from a picture, scaled and placed as the grid wants it.
 
     The structure is scaled, its proportions kept, until it is as high as the grid, or as wide where
     it would become wider than the grid; it is set on the ground line and centred. A pixel is set when
@@ -44,15 +45,15 @@ def read_silhouette(source: str | Path | ArrayLike, grid: Grid = PAPER_GRID, exa
         source: An image file, or an array: (H, W) bool with True where the structure is, or grey
             (H, W), or uint8 colour (H, W, 3) or (H, W, 4).
         grid: Scale and place of the result.
-        exact: True insists on taking the picture as it is (size and two values suffice then), False
-            on scaling it; None decides by the rule above.
+        exact: True takes the picture as it is (its size and two values suffice then), False always
+            scales it, None decides by the rule above.
 
     Raises:
-        StackgenError: If there is no picture, or nothing or everything in it.
+        StackgenError: If the picture cannot be read, is empty, or is filled to its edges.
 
     >>> tower = np.zeros((100, 80), bool)
     >>> tower[20:60, 10:20] = True  # four times as high as wide
-    >>> placed = read_silhouette(tower)
+    >>> placed = read_silhouette(tower, Grid())
     >>> placed.shape, int(placed.sum()), int(placed[59].sum())
     ((64, 64), 784, 14)
     """
@@ -72,8 +73,20 @@ def read_silhouette(source: str | Path | ArrayLike, grid: Grid = PAPER_GRID, exa
         raise StackgenError(f"{source if is_file else 'the picture'}: {error}") from error
 
 
+def read_picture(path: str | Path) -> Picture:
+    """Read a colour picture (H, W, 3), upright.
+
+    Raises:
+        StackgenError: If the file is no picture.
+    """
+    try:
+        return np.array(_open(Path(path)).convert("RGB"))
+    except StackgenError as error:
+        raise StackgenError(f"{path}: {error}") from error
+
+
 def _difference(source: str | Path | ArrayLike) -> tuple[Levels, float]:
-    """How much each pixel (H, W) differs from the background [0..255], and the scale it was reduced by."""
+    """Return how much each pixel (H, W) differs from the background [0..255], and the scale of the reduced picture."""
     if isinstance(source, str | Path):
         picture = _open(Path(source))
     else:
@@ -97,7 +110,7 @@ def _difference(source: str | Path | ArrayLike) -> tuple[Levels, float]:
 
 
 def _open(path: Path) -> Image:
-    """The first frame of an image file, upright; 16-bit and float grey become 8-bit."""
+    """Open the first frame of an image file, upright; 16-bit and float grey become 8-bit."""
     from PIL import Image, ImageOps, UnidentifiedImageError
 
     try:
@@ -124,7 +137,7 @@ def _open(path: Path) -> Image:
 
 
 def _from_array(array: NDArray[Any]) -> Image:
-    """An array of grey (H, W) or uint8 colour (H, W, 3 or 4) as an image."""
+    """Convert an array of grey (H, W) or uint8 colour (H, W, 3 or 4) to an image."""
     from PIL import Image
 
     is_grey = array.ndim == 2 and array.max(initial=0) > 1  # 0 and 1 alone are a mask, and stretched below
@@ -143,14 +156,14 @@ def _from_array(array: NDArray[Any]) -> Image:
 
 
 def _channels(picture: Image) -> tuple[Levels, Levels]:
-    """Colour on white (H, W, 3) and opacity (H, W, 1), both 0..255."""
+    """Split into colour on white (H, W, 3) and opacity (H, W, 1), both 0..255."""
     rgba = np.asarray(picture.convert("RGBA"), dtype=np.float32)
     alpha = rgba[..., 3:]
     return (rgba[..., :3] * (alpha / 255) + (255 - alpha)).astype(np.float32), alpha
 
 
 def _unlike_background(levels: Levels) -> Levels:
-    """Largest difference (H, W) of any channel of `levels` (H, W, C) from the background's.
+    """Return the largest difference (H, W) of any channel of `levels` (H, W, C) from the background's.
 
     The background is the median along the picture's upper, left and right edges: structures often
     stand on the lower one. Taking the largest channel makes colours of equal brightness differ, and
@@ -163,7 +176,7 @@ def _unlike_background(levels: Levels) -> Levels:
 
 
 def _structure(difference: Levels, scale: float) -> Mask:
-    """The structure's pixels, cut out to its bounding box, at 768 pixels for the picture's longer edge."""
+    """Cut the structure's pixels out to their bounding box, at 768 pixels for the picture's longer edge."""
     import cv2
 
     enlarge = max(1.0, _WORK_SIZE / max(difference.shape))
@@ -190,7 +203,7 @@ def _too_small(what: str, width: int, height: int) -> StackgenError:
 
 
 def _threshold(difference: Levels) -> float:
-    """Where the structure begins: Otsu's threshold, lowered while a paler part of the structure lies under it.
+    """Find the level where the structure begins: Otsu's, lowered while a paler part of the structure lies under it.
 
     A white house with a dark roof on grey has two steps. A paler part is told from a blurred edge by
     its thickness, and from uneven lighting by a clear step and by not reaching the picture's edge.
@@ -217,7 +230,7 @@ def _threshold(difference: Levels) -> float:
 
 
 def _otsu(values: Levels) -> float:
-    """The middle between the means of two groups of values [0..255], split by Otsu's method (1979)."""
+    """Return the middle between the means of two groups of values [0..255], split by Otsu's method (1979)."""
     import cv2
 
     levels = np.clip(values, 0, 255).astype(np.uint8).ravel()
@@ -227,7 +240,7 @@ def _otsu(values: Levels) -> float:
 
 
 def _clean(mask: Mask) -> Mask:
-    """The mask without parts, and without holes, that are tiny beside its largest part."""
+    """Remove parts and fill holes that are tiny beside the mask's largest part."""
     labels, areas = components(mask, connectivity=4)
     limit = _SPECK * areas.max()
     kept = (areas >= max(limit, 1))[labels]
@@ -236,7 +249,7 @@ def _clean(mask: Mask) -> Mask:
 
 
 def _fits(mask: Mask, grid: Grid) -> bool:
-    """Whether a mask (image_size square) is placed and scaled as the grid's silhouettes are."""
+    """Tell whether a mask (image_size square) is placed and scaled as the grid's silhouettes are."""
     rows, columns = bounding_box(mask)
     inside = rows.start > 0 and columns.start > 0 and columns.stop < grid.image_size
     on_ground = rows.stop == round(grid.image_size - grid.ground_margin)
@@ -247,7 +260,10 @@ def _fits(mask: Mask, grid: Grid) -> bool:
 
 
 def _place(cut: Mask, grid: Grid) -> Mask:
-    """A structure cut out to its box, scaled to fill the grid, on the ground and centred."""
+    """Scale a structure that is cut out to its box until it fills the grid, on the ground and centred.
+
+    OpenCV's INTER_AREA scales to whole pixels only, which moves edges: 3 of the 12 examples would change.
+    """
     height, width = cut.shape
     scale = grid.pixels_per_cell * min(grid.height / height, grid.width / width)  # [target pixel per pixel]
     columns = (np.arange(grid.image_size + 1) - grid.image_size / 2) / scale + width / 2
@@ -260,22 +276,22 @@ def _place(cut: Mask, grid: Grid) -> Mask:
 
 
 def _overlap(edges: NDArray[np.float64], length: int) -> NDArray[np.float64]:
-    """(n, length) share of the interval between each two `edges` (n + 1) that each unit cell 0..length covers."""
+    """Return the share (n, length) of each interval between `edges` (n + 1) that each of `length` unit cells covers."""
     low, high = edges[:-1, None], edges[1:, None]
     cells = np.arange(length)
     return np.clip(np.minimum(high, cells + 1) - np.maximum(low, cells), 0, None) / (high - low)
 
 
-def grid_offset(silhouette: Mask, grid: Grid = PAPER_GRID) -> int:
-    """By how many pixels to shift a silhouette so that its upright edges fall on the grid's cell lines.
+def grid_offset(silhouette: Mask, grid: Grid) -> int:
+    """Find by how many pixels to shift a silhouette so that its upright edges fall on the grid's cell lines.
 
     Stacks of the generator stand on the cells of the grid, so samplers trained on them know edges there
-    and nowhere else; a drawing is centred, which puts a structure of odd width half a cell beside. At
-    most half a cell; of equally good offsets the smallest.
+    and nowhere else; a drawing is centred, which puts a structure of odd width half a cell beside. The
+    shift is at most half a cell; the smallest of equally good ones is taken.
 
     >>> picture = np.zeros((64, 64), dtype=bool)
     >>> picture[4:60, 25:39] = True  # a tower, one cell wide, in the middle
-    >>> abs(grid_offset(picture))
+    >>> abs(grid_offset(picture, Grid()))
     7
     """
     steps = np.diff(silhouette.astype(np.int8), axis=1, prepend=0, append=0)

@@ -13,14 +13,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.vision.cells import Ints, block_list, in_cells
-from stackgen.vision.depth import Picture, read_picture
-from stackgen.vision.drawings import read_silhouette
-from stackgen.world import PAPER_GRID, Grid, Mask
+from stackgen.vision.cells import Ints, in_cells
+from stackgen.vision.drawings import Picture, read_picture, read_silhouette
+from stackgen.vision.masks import bounding_box, smoothed, without_specks
+from stackgen.world import Grid, Mask
 
 Floats = NDArray[np.float64]
 
@@ -28,10 +29,10 @@ WORK_SIZE = 1000
 """Longer edge [pixel] that photos are brought to."""
 
 FOCAL = 0.75
-"""Focal length of the camera by the photo's longer edge: a telephone's, a webcam's or a RealSense's is near it."""
+"""Focal length of a usual camera by the photo's longer edge: a telephone's, a webcam's or a RealSense's is near it."""
 
 FOCALS = (0.6, 1.6)
-"""Least and largest, likewise, that is believed."""
+"""Least and largest focal length that is believed, by the photo's longer edge."""
 
 SHEET = 0.15
 """A sheet is at least this share of the photo; where none is found the whole photo is sheet."""
@@ -43,19 +44,19 @@ SPECK = 0.03
 """Parts under this share of the largest are dirt."""
 
 ALIKE = 0.75
-"""IoU with the drawing, stretched, from which on it is taken to be made of whole cells."""
+"""Least IoU with the stretched drawing for it to count as made of whole cells."""
 
 
 @dataclass(frozen=True)
 class Sketch:
-    """What was found in a photo of a drawing.
+    """The drawing that was found in a photo.
 
     Args:
         silhouette: (H, W) on the grid: that of the cells where the drawing is made of whole cells, else as drawn.
         drawn: (H, W) on the grid, as drawn.
         cells: (rows, columns) EMPTY, FULL or TRIANGLE, the first row on the ground; None where the drawing is not
             made of whole cells.
-        counts: (S,) block list by the heuristic; None without cells, or with too many.
+        block_list: (S,) block list guessed from the cells; None without cells, or with too many.
         sheet: (4, 2) corners of the sheet in the photo [pixel], from the upper left clockwise.
         photo: (h, w, 3) at `WORK_SIZE`.
         ink: (h', w') the drawing on the sheet, filled in.
@@ -64,14 +65,14 @@ class Sketch:
     silhouette: Mask
     drawn: Mask
     cells: Ints | None
-    counts: Ints | None
+    block_list: Ints | None
     sheet: Floats
     photo: Picture
     ink: Mask
 
 
-def read_sketch(source: str | Path | Picture, grid: Grid = PAPER_GRID) -> Sketch:
-    """The drawing in a photo.
+def read_sketch(source: str | Path | Picture, grid: Grid) -> Sketch:
+    """Read the drawing in a photo.
 
     Args:
         source: An image file, or (h, w, 3) uint8.
@@ -80,26 +81,25 @@ def read_sketch(source: str | Path | Picture, grid: Grid = PAPER_GRID) -> Sketch
     Raises:
         StackgenError: If there is no photo, nothing drawn, an outline that is open, or more than one drawing.
     """
-    picture = read_picture(source) if isinstance(source, str | Path) else np.asarray(source, dtype=np.uint8)
+    if not isinstance(source, str | Path):
+        return _sketch(_scaled(np.asarray(source, dtype=np.uint8)), grid)
+    picture = read_picture(source)
     try:
         return _sketch(_scaled(picture), grid)
     except StackgenError as error:
-        raise StackgenError(f"{source}: {error}" if isinstance(source, str | Path) else str(error)) from error
+        raise StackgenError(f"{source}: {error}") from error
 
 
 def _sketch(photo: Picture, grid: Grid) -> Sketch:
-    """The steps, one after the other."""
+    """Take the steps one after the other."""
     sheet = find_sheet(photo)
     ink = one_drawing(filled_in(binarised(straightened(photo, sheet))))
     drawn = read_silhouette(ink, grid, exact=False)
-    cells, silhouette = in_cells(drawn, ALIKE, grid) or (None, drawn)
-    counts = None if cells is None else block_list(cells)
-    return Sketch(silhouette, drawn, cells, counts, sheet, photo, ink)
+    silhouette, cells, block_list = in_cells(drawn, ALIKE, grid)
+    return Sketch(silhouette, drawn, cells, block_list, sheet, photo, ink)
 
 
 def _scaled(picture: Picture) -> Picture:
-    import cv2
-
     if min(picture.shape[:2]) < 64:
         raise StackgenError(f"the photo is only {picture.shape[1]} x {picture.shape[0]} pixels; take a larger one")
     factor = WORK_SIZE / max(picture.shape[:2])
@@ -109,13 +109,12 @@ def _scaled(picture: Picture) -> Picture:
 
 
 def find_sheet(photo: Picture) -> Floats:
-    """Corners (4, 2) of the sheet of paper in a photo [pixel], from the upper left clockwise; the photo's own if none.
+    """Find the corners (4, 2) of the sheet of paper in a photo [pixel], from the upper left clockwise.
 
     A sheet is white, convex, and has four corners. In uneven light its dark end may be hardly brighter than a table in
-    the sun: of several thresholds the one counts whose quadrangle has the clearest edges.
+    the sun: of several thresholds the one counts whose quadrangle has the clearest edges. Without a sheet the corners
+    are the photo's own.
     """
-    import cv2
-
     height, width = photo.shape[:2]
     white = cv2.medianBlur(photo.min(axis=2), 9)  # of a coloured table one channel is darker than of grey paper
     level, _ = cv2.threshold(white, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
@@ -127,7 +126,7 @@ def find_sheet(photo: Picture) -> Floats:
 
 
 def _step(white: NDArray[np.uint8], corners: Floats) -> float:
-    """By what share it becomes darker across the edges of a quadrangle (4, 2), clockwise: the least of the four."""
+    """Return by what share it becomes darker across the four edges of a clockwise quadrangle (4, 2), at least."""
     steps, off = [], 0.01 * max(white.shape)
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         along = (end - start) / np.linalg.norm(end - start)
@@ -142,9 +141,7 @@ def _step(white: NDArray[np.uint8], corners: Floats) -> float:
 
 
 def _four_corners(bright: NDArray[np.uint8]) -> Floats | None:
-    """Corners (4, 2) of the largest bright part, if it is a quadrangle as large as a sheet."""
-    import cv2
-
+    """Find the corners (4, 2) of the largest bright part, if it is a quadrangle as large as a sheet."""
     bright = cv2.morphologyEx(bright, cv2.MORPH_OPEN, np.ones((9, 9), np.uint8)).astype(np.uint8)
     contours, _ = cv2.findContours(bright, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
     if not contours:
@@ -159,7 +156,7 @@ def _four_corners(bright: NDArray[np.uint8]) -> Floats | None:
 
 
 def _clockwise(corners: Floats) -> Floats:
-    """Corners (4, 2) from the upper left clockwise, as they are seen in the photo."""
+    """Order corners (4, 2) from the upper left clockwise, as they are seen in the photo."""
     middle = corners.mean(axis=0)
     angles = np.arctan2(*(corners - middle).T[::-1])
     corners = corners[np.argsort(angles)]  # y points down: growing angles run clockwise
@@ -167,9 +164,7 @@ def _clockwise(corners: Floats) -> Floats:
 
 
 def straightened(photo: Picture, sheet: Floats) -> NDArray[np.uint8]:
-    """(h', w') grey: the sheet as seen straight on, less a border where its edge might show."""
-    import cv2
-
+    """Return the sheet as seen straight on, (h', w') grey, less a border where its edge might show."""
     grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
     if np.allclose(sheet, [[0, 0], [grey.shape[1], 0], grey.shape[::-1], [0, grey.shape[0]]]):
         return np.asarray(grey, dtype=np.uint8)
@@ -183,14 +178,14 @@ def straightened(photo: Picture, sheet: Floats) -> NDArray[np.uint8]:
 
 
 def sheet_ratio(corners: Floats, edge: float) -> float:
-    """Width by height of a rectangle from its picture.
+    """Estimate width by height of a rectangle from its picture.
 
     Two pairs of parallel edges tell the focal length, and with it the proportions (Zhang and He, "Whiteboard scanning
     and image enhancement", 2007, section 3). A sheet seen nearly straight on tells it badly, so it is kept to what
     cameras have; there it matters little.
 
     Args:
-        corners: (4, 2) clockwise from the upper left, from the middle of the photo [pixel].
+        corners: (4, 2) clockwise from the upper left, relative to the middle of the photo [pixel].
         edge: Longer edge of the photo [pixel].
 
     >>> round(sheet_ratio(np.array([[-2.0, -1], [2, -1], [2, 1], [-2, 1]]), 5.0), 6)
@@ -208,7 +203,7 @@ def sheet_ratio(corners: Floats, edge: float) -> float:
 
 
 def binarised(grey: NDArray[np.uint8]) -> Mask:
-    """(H, W) where ink takes light away: a threshold that follows the light.
+    """Find where ink takes light away (H, W), by a threshold that follows the light.
 
     Raises:
         StackgenError: If the sheet is empty.
@@ -223,7 +218,7 @@ def binarised(grey: NDArray[np.uint8]) -> Mask:
 
 
 def _light(grey: Floats) -> Floats:
-    """(H, W) the light on the blank sheet: a cubic surface through its pixels, fitted again without what is darker."""
+    """Estimate the light (H, W) on the blank sheet: a cubic surface, fitted again and again without what is darker."""
     height, width = grey.shape
     y, x = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     terms = np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=-1)
@@ -237,17 +232,15 @@ def _light(grey: Floats) -> Floats:
 
 
 def filled_in(ink: Mask) -> Mask:
-    """The drawing with its outlines filled in; what is filled already keeps its windows.
+    """Fill in the outlines of a drawing; what is filled already keeps its windows.
 
     An outline within an outline that it does not touch is a window's. A missing base line is drawn.
 
     Raises:
         StackgenError: If an outline is open.
     """
-    import cv2
-
     size = max(ink.shape)
-    ink = _without_specks(ink, SPECK / 10)
+    ink = without_specks(ink, SPECK / 10)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * (size // 160) + 1,) * 2)
     closed = cv2.morphologyEx(ink.astype(np.uint8), cv2.MORPH_CLOSE, kernel).astype(np.uint8)
     stroke = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * (size // 45) + 1,) * 2)
@@ -263,13 +256,11 @@ def filled_in(ink: Mask) -> Mask:
             whole = _inside(closed)
         if np.count_nonzero(whole) < 2 * np.count_nonzero(closed):
             raise StackgenError("the outline of the drawing is open; close its gaps, or fill it in")
-    return np.asarray(cv2.medianBlur(whole * 255, 2 * (size // 130) + 1) > 0)
+    return smoothed(whole > 0, 2 * (size // 130) + 1)
 
 
 def _inside(ink: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """What the outermost outlines enclose, less what outlines within them do."""
-    import cv2
-
+    """Fill what the outermost outlines enclose, less what outlines within them do."""
     contours, tree = cv2.findContours(ink, cv2.RETR_TREE, cv2.CHAIN_APPROX_NONE)
     parents = tree[0, :, 3]
     whole = np.zeros_like(ink)
@@ -284,31 +275,19 @@ def _inside(ink: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def one_drawing(mask: Mask) -> Mask:
-    """The drawing, without dirt.
+    """Remove dirt, and see that one drawing is left.
 
     Raises:
         StackgenError: If there are several, half a cell or more apart, or it runs off the sheet.
     """
-    import cv2
-
-    mask = _without_specks(mask, SPECK)
-    rows = np.flatnonzero(mask.any(axis=1))
-    if not len(rows):
+    mask = without_specks(mask, SPECK)
+    if not mask.any():
         raise StackgenError("nothing but specks is drawn on the sheet; draw a structure with a dark pen")
-    gap = max(3, (int(np.ptp(rows)) + 1) // 8 // 2 * 2 + 1)
+    rows, _ = bounding_box(mask)
+    gap = max(3, (rows.stop - rows.start) // 8 // 2 * 2 + 1)
     number, _ = cv2.connectedComponents(cv2.dilate(mask.astype(np.uint8), np.ones((gap, gap), np.uint8)))
     if number > 2:
         raise StackgenError(f"{number - 1} drawings are on the sheet; cover or crop all but one")
     if mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any():
         raise StackgenError("the drawing runs off the sheet; leave some blank paper around it")
     return mask
-
-
-def _without_specks(mask: Mask, share: float) -> Mask:
-    """The parts that are not tiny beside the largest."""
-    import cv2
-
-    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=8)
-    areas = np.bincount(labels.ravel())
-    areas[0] = 0
-    return np.asarray((areas >= max(share * areas.max(), 1))[labels])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import runpy
 import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,10 +16,14 @@ from stackgen.commands.cli import main
 from stackgen.errors import StackgenError
 from stackgen.geometry import iou, silhouette
 from stackgen.stack import Stack
+from stackgen.vision import depth, drawings
 from stackgen.vision.cameras import Rig, realsense_frame, simulated_frame
-from stackgen.vision.depth import Frame, capture, largest, read_frame
-from stackgen.vision.drawings import read_silhouette
+from stackgen.vision.depth import DepthFrame, read_frame
+from stackgen.vision.masks import largest
+from stackgen.world import PAPER_GRID
 
+read_silhouette = partial(drawings.read_silhouette, grid=PAPER_GRID)
+find_structure = partial(depth.find_structure, grid=PAPER_GRID)
 ROOT = Path(__file__).parents[2]
 PHOTOS = ROOT / "examples" / "photos"
 DRAWN = runpy.run_path(str(ROOT / "examples" / "draw_photos.py"))
@@ -26,7 +31,7 @@ CASTLE, HOUSE, ARCH = (DRAWN[name] for name in ("CASTLE", "HOUSE", "ARCH"))
 
 
 def truth(stack: Stack) -> np.ndarray:
-    return read_silhouette(silhouette(stack), exact=False)
+    return read_silhouette(silhouette(stack, PAPER_GRID), exact=False)
 
 
 @pytest.mark.parametrize(
@@ -40,32 +45,32 @@ def truth(stack: Stack) -> np.ndarray:
     ],
 )
 def test_the_silhouette_is_that_of_the_stack(stack: Stack, rig: Rig) -> None:
-    found = capture(simulated_frame(stack, rig))
+    found = find_structure(simulated_frame(stack, rig))
     assert iou(found.as_seen, truth(stack)) >= 0.9
     assert iou(found.silhouette, truth(stack)) >= 0.98
-    assert found.counts is not None and found.left_out < 0.01
+    assert found.block_list is not None and found.left_out < 0.01
 
 
 def test_what_is_not_made_of_whole_cells_stays_as_seen() -> None:
     poses = [[0.5 * z, 0, z + 0.5, 0, 0, 0] for z in range(4)]
     steps = Stack(np.array([0, 1, 1, 1]), np.array(poses))
-    found = capture(simulated_frame(steps))
-    assert np.array_equal(found.silhouette, found.as_seen) and found.cells is None and found.counts is None
+    found = find_structure(simulated_frame(steps))
+    assert np.array_equal(found.silhouette, found.as_seen) and found.cells is None and found.block_list is None
 
 
 def test_sizes_are_in_metres() -> None:
-    width, height = capture(simulated_frame(CASTLE, Rig(elevation=10))).size
+    width, height = find_structure(simulated_frame(CASTLE, Rig(elevation=10))).size
     assert width == pytest.approx(0.20, abs=0.006) and height == pytest.approx(0.20, abs=0.010)
 
 
 def test_the_camera_may_stand_nearer_or_further() -> None:
-    near, far = (capture(simulated_frame(HOUSE, Rig(distance=d))).silhouette for d in (0.55, 0.9))
+    near, far = (find_structure(simulated_frame(HOUSE, Rig(distance=d))).silhouette for d in (0.55, 0.9))
     assert iou(near, far) >= 0.9
 
 
 def test_a_block_beside_the_structure_is_left_out() -> None:
     beside = Stack(np.append(ARCH.shapes, 0), np.vstack([ARCH.poses, [3.2, 0, 0.5, 0, 0, 0]]))
-    found = capture(simulated_frame(beside))
+    found = find_structure(simulated_frame(beside))
     assert iou(found.silhouette, truth(ARCH)) >= 0.9
     assert found.left_out == pytest.approx(1 / 9, abs=0.03)  # a cube beside nine cells
 
@@ -73,7 +78,7 @@ def test_a_block_beside_the_structure_is_left_out() -> None:
 @pytest.mark.parametrize(("name", "stack"), [("stack-castle", CASTLE), ("stack-house", HOUSE)])
 def test_the_example_frames_are_of_their_stacks(name: str, stack: Stack) -> None:
     frame = read_frame(PHOTOS / f"{name}-depth.png", PHOTOS / f"{name}-color.jpg")
-    assert iou(capture(frame).silhouette, truth(stack)) >= 0.9
+    assert iou(find_structure(frame).silhouette, truth(stack)) >= 0.9
 
 
 def test_frames_are_read_as_they_were_written(tmp_path: Path) -> None:
@@ -87,14 +92,14 @@ def test_frames_are_read_as_they_were_written(tmp_path: Path) -> None:
 def test_the_background_alone_holds_nothing() -> None:
     empty = Stack(np.zeros(0, dtype=int), np.zeros((0, 6)))
     with pytest.raises(StackgenError, match="nothing stands in front of the background"):
-        capture(simulated_frame(empty))
+        find_structure(simulated_frame(empty))
 
 
 def test_a_frame_without_depth_is_refused() -> None:
     with pytest.raises(StackgenError, match="the frame has no depth"):
-        Frame(np.zeros((480, 640)))
+        DepthFrame(np.zeros((480, 640)))
     with pytest.raises(StackgenError, match="align"):
-        Frame(np.ones((480, 640)), np.zeros((240, 320, 3), dtype=np.uint8))
+        DepthFrame(np.ones((480, 640)), np.zeros((240, 320, 3), dtype=np.uint8))
 
 
 def test_the_largest_component_bridges_small_gaps_only() -> None:
@@ -189,7 +194,7 @@ def test_a_realsense_frame_is_depth_in_metres_seen_by_the_colour_camera(monkeypa
     frame = realsense_frame()
     assert np.abs(frame.depth - sent.depth).max() < 2e-4 and stopped == [True]
     assert frame.camera == (sent.focal, 320.0, 240.0)
-    assert iou(capture(frame).silhouette, truth(CASTLE)) >= 0.9
+    assert iou(find_structure(frame).silhouette, truth(CASTLE)) >= 0.9
 
 
 def test_examples_stay_small() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +15,11 @@ from PIL import Image, ImageFilter
 from stackgen.errors import StackgenError
 from stackgen.geometry import iou, mirror, silhouette
 from stackgen.stack import Stack
-from stackgen.vision.drawings import grid_offset, read_silhouette
-from stackgen.world import Grid, Mask
+from stackgen.vision import drawings
+from stackgen.vision.drawings import grid_offset
+from stackgen.world import PAPER_GRID, Grid, Mask
 
+read_silhouette = partial(drawings.read_silhouette, grid=PAPER_GRID)
 LARGE = Grid(image_size=480, pixels_per_cell=100, ground_margin=40)
 
 # Centred, four cells high or wide, on the ground: reading them changes nothing.
@@ -54,10 +57,10 @@ def stack(request: pytest.FixtureRequest) -> Stack:
 @pytest.mark.parametrize("blur", [0, 2, 4])
 @pytest.mark.parametrize("size", [32, 64, 150, 480, 1300])
 def test_drawings_of_any_size_and_softness_come_back_as_the_truth(stack: Stack, size: int, blur: int) -> None:
-    drawing = painted(silhouette(stack, grid=LARGE)).filter(ImageFilter.GaussianBlur(blur))
+    drawing = painted(silhouette(stack, LARGE)).filter(ImageFilter.GaussianBlur(blur))
     read = read_silhouette(np.asarray(drawing.resize((size, size), Image.Resampling.BOX)))
     # At 7 pixels a cell the tip of a blurred triangle is lost, and the rest is scaled up to make up for it.
-    assert iou(read, silhouette(stack)) >= (0.95 if size > 40 else 0.9)
+    assert iou(read, silhouette(stack, PAPER_GRID)) >= (0.95 if size > 40 else 0.9)
 
 
 COLOURS = [
@@ -74,16 +77,14 @@ COLOURS = [
 def test_colours_and_polarity_do_not_matter(
     stack: Stack, ink: tuple[int, int, int], paper: tuple[int, int, int]
 ) -> None:
-    mask = silhouette(stack, grid=LARGE)
+    mask = silhouette(stack, LARGE)
     assert (read_silhouette(np.asarray(painted(mask, ink, paper))) == read_silhouette(mask)).all()
 
 
 @pytest.mark.parametrize("quality", [15, 50, 95])
 def test_jpeg_noise_does_not_matter(stack: Stack, quality: int, tmp_path: Path) -> None:
-    path = saved(
-        painted(silhouette(stack, grid=LARGE), (180, 40, 30), (90, 130, 200)), tmp_path / "a.jpg", quality=quality
-    )
-    assert iou(read_silhouette(path), silhouette(stack)) >= 0.97
+    path = saved(painted(silhouette(stack, LARGE), (180, 40, 30), (90, 130, 200)), tmp_path / "a.jpg", quality=quality)
+    assert iou(read_silhouette(path), silhouette(stack, PAPER_GRID)) >= 0.97
 
 
 def as_mode(mode: str) -> Callable[[Image.Image], Image.Image]:
@@ -111,7 +112,7 @@ FORMS |= {"16 bit": as_16_bit, "alpha": as_alpha, "stencil": as_stencil}
 
 @pytest.mark.parametrize("form", FORMS)
 def test_the_kind_of_image_does_not_matter(stack: Stack, form: str, tmp_path: Path) -> None:
-    mask = silhouette(stack, grid=LARGE)
+    mask = silhouette(stack, LARGE)
     image = FORMS[form](painted(mask))
     path = saved(image, tmp_path / ("a.tif" if image.mode == "CMYK" else "a.png"))
     assert (read_silhouette(path) == read_silhouette(mask)).all()
@@ -119,7 +120,7 @@ def test_the_kind_of_image_does_not_matter(stack: Stack, form: str, tmp_path: Pa
 
 @pytest.mark.parametrize("form", ["1", "P", "alpha"])
 def test_the_kind_of_a_large_image_does_not_matter_either(form: str, tmp_path: Path) -> None:
-    mask = np.kron(silhouette(stack_of("gate"), grid=LARGE), np.ones((4, 4), dtype=bool))
+    mask = np.kron(silhouette(stack_of("gate"), LARGE), np.ones((4, 4), dtype=bool))
     image = painted(mask, (10, 60, 200), (250, 220, 90)) if form == "P" else painted(mask)
     path = saved(FORMS[form](image), tmp_path / "a.png")
     assert iou(read_silhouette(path), read_silhouette(mask)) > 0.99
@@ -127,7 +128,7 @@ def test_the_kind_of_a_large_image_does_not_matter_either(form: str, tmp_path: P
 
 @pytest.mark.parametrize("dtype", ["uint8", "uint16", "int32", "float32"])
 def test_the_kind_of_array_does_not_matter(stack: Stack, dtype: str) -> None:
-    mask = silhouette(stack, grid=LARGE)
+    mask = silhouette(stack, LARGE)
     assert (
         read_silhouette(mask.astype(dtype) * 200 if dtype != "float32" else mask.astype(dtype)) == read_silhouette(mask)
     ).all()
@@ -146,7 +147,7 @@ def test_a_photo_is_turned_as_its_exif_says(orientation: int, tmp_path: Path) ->
         T.TRANSVERSE,
         T.ROTATE_270,
     ]
-    mask = silhouette(stack_of("stairs"), grid=LARGE)
+    mask = silhouette(stack_of("stairs"), LARGE)
     image, turn = painted(mask), undo[orientation - 1]
     exif = Image.Exif()
     exif[0x0112] = orientation
@@ -156,29 +157,28 @@ def test_a_photo_is_turned_as_its_exif_says(orientation: int, tmp_path: Path) ->
 
 @pytest.mark.parametrize(("left", "top", "right", "bottom"), [(0, 0, 300, 0), (90, 200, 10, 0), (500, 7, 7, 300)])
 def test_where_the_structure_is_does_not_matter(stack: Stack, left: int, top: int, right: int, bottom: int) -> None:
-    mask = silhouette(stack, grid=LARGE)
+    mask = silhouette(stack, LARGE)
     moved = np.pad(mask, ((top, bottom), (left, right)))
     picture = np.asarray(painted(moved, (20, 30, 60), (240, 230, 200)))
     assert iou(read_silhouette(picture), read_silhouette(mask)) >= 0.97
 
 
 def test_a_structure_may_stand_on_the_pictures_lower_edge(stack: Stack) -> None:
-    mask = silhouette(stack, grid=Grid(image_size=480, pixels_per_cell=100, ground_margin=0))
-    assert (read_silhouette(np.asarray(painted(mask))) == silhouette(stack)).mean() > 0.998
+    mask = silhouette(stack, Grid(image_size=480, pixels_per_cell=100, ground_margin=0))
+    assert (read_silhouette(np.asarray(painted(mask))) == silhouette(stack, PAPER_GRID)).mean() > 0.998
 
 
 def test_mirrored_pictures_give_mirrored_silhouettes(stack: Stack) -> None:
-    soft = painted(silhouette(stack, grid=LARGE)).filter(ImageFilter.GaussianBlur(2))
+    soft = painted(silhouette(stack, LARGE)).filter(ImageFilter.GaussianBlur(2))
     picture = np.asarray(soft.resize((233, 233)))
     assert (read_silhouette(picture[:, ::-1]) == read_silhouette(picture)[:, ::-1]).mean() > 0.998
     assert (
-        read_silhouette(silhouette(mirror(stack), grid=LARGE))
-        == read_silhouette(silhouette(stack, grid=LARGE))[:, ::-1]
+        read_silhouette(silhouette(mirror(stack), LARGE)) == read_silhouette(silhouette(stack, LARGE))[:, ::-1]
     ).all()
 
 
 def test_specks_and_pinholes_are_dirt_but_small_blocks_are_not() -> None:
-    mask = silhouette(stack_of("gate"), grid=LARGE)
+    mask = silhouette(stack_of("gate"), LARGE)
     dirty = mask.copy()
     dirty[3:9, 3:9] = True  # in the corner
     dirty[20:23, 400] = True
@@ -195,13 +195,13 @@ def test_specks_and_pinholes_are_dirt_but_small_blocks_are_not() -> None:
 
 def test_pale_parts_belong_to_the_structure_and_uneven_light_does_not() -> None:
     stack = stack_of("gate")
-    mask = silhouette(stack, grid=LARGE)
+    mask = silhouette(stack, LARGE)
     two_tone = np.array(painted(mask, (40, 20, 20)))
     two_tone[: 4 * 35 + 60][mask[: 4 * 35 + 60]] = (250, 220, 150)  # pale turrets
     assert (read_silhouette(two_tone) == read_silhouette(mask)).all()
     shade = np.linspace(1, 0.7, mask.shape[1])[None, :, None]
     lit = np.random.default_rng(0).normal(np.asarray(painted(mask, (60, 60, 70), (235, 230, 220))) * shade, 5)
-    assert iou(read_silhouette(np.clip(lit, 0, 255).astype(np.uint8)), silhouette(stack)) > 0.97
+    assert iou(read_silhouette(np.clip(lit, 0, 255).astype(np.uint8)), silhouette(stack, PAPER_GRID)) > 0.97
 
 
 def test_it_fills_the_height_and_where_too_wide_the_width() -> None:
@@ -220,7 +220,7 @@ def test_a_silhouette_of_the_grid_is_taken_as_it_is_wherever_it_stands() -> None
     shapes, x, z = STACKS["gate"]
     poses = np.zeros((len(shapes), 6))
     poses[:, 0], poses[:, 2], poses[:, 5] = np.array(x) + 0.3, z, 0.02
-    mask = silhouette(Stack(np.array(shapes), poses))
+    mask = silhouette(Stack(np.array(shapes), poses), PAPER_GRID)
     for picture in (mask, mask.astype(np.uint8), np.asarray(painted(mask)), 255 - 255 * mask.astype(np.uint8)):
         assert (read_silhouette(picture) == mask).all()
         assert not (read_silhouette(picture, exact=False) == mask).all()
@@ -233,13 +233,13 @@ def test_a_silhouette_of_the_grid_is_taken_as_it_is_wherever_it_stands() -> None
 
 def test_another_grid_gives_its_own_size() -> None:
     assert (
-        read_silhouette(silhouette(stack_of("stairs")), LARGE) == silhouette(stack_of("stairs"), grid=LARGE)
+        read_silhouette(silhouette(stack_of("stairs"), PAPER_GRID), grid=LARGE) == silhouette(stack_of("stairs"), LARGE)
     ).mean() > 0.98
 
 
 def truncated(path: Path) -> None:
     buffer = io.BytesIO()
-    painted(silhouette(stack_of("gate"), grid=LARGE)).save(buffer, "PNG" if path.suffix == ".png" else "JPEG")
+    painted(silhouette(stack_of("gate"), LARGE)).save(buffer, "PNG" if path.suffix == ".png" else "JPEG")
     path.write_bytes(buffer.getvalue()[: len(buffer.getvalue()) // 2])
 
 
@@ -296,16 +296,16 @@ def test_a_bad_array_gets_one_line(array: NDArray, trouble: str) -> None:
 @pytest.mark.parametrize("name", STACKS)
 def test_grid_offset_undoes_a_shift(name: str, shift: int) -> None:
     stack = stack_of(name)
-    widest = np.ptp(np.flatnonzero(silhouette(stack).any(axis=0))) + 1
+    widest = np.ptp(np.flatnonzero(silhouette(stack, PAPER_GRID).any(axis=0))) + 1
     if widest + 2 * abs(shift) > 64:
         pytest.skip("does not fit on the canvas")
-    moved = np.roll(silhouette(stack), shift, axis=1)
-    there = np.flatnonzero(silhouette(stack).any(axis=0))[0]
-    phase = (there + shift + grid_offset(moved) - 32) % 14
+    moved = np.roll(silhouette(stack, PAPER_GRID), shift, axis=1)
+    there = np.flatnonzero(silhouette(stack, PAPER_GRID).any(axis=0))[0]
+    phase = (there + shift + grid_offset(moved, PAPER_GRID) - 32) % 14
     assert min(phase, 14 - phase) <= 1
 
 
 @pytest.mark.parametrize("name", STACKS)
 def test_grid_offset_of_the_mirror_image_is_as_large(name: str) -> None:
-    mask = silhouette(stack_of(name))
-    assert abs(grid_offset(mask[:, ::-1])) == abs(grid_offset(mask))
+    mask = silhouette(stack_of(name), PAPER_GRID)
+    assert abs(grid_offset(mask[:, ::-1], PAPER_GRID)) == abs(grid_offset(mask, PAPER_GRID))
