@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
-from stackgen.io.stacks_file import Entry, StacksFile, Weights
+from stackgen.io.stacks_file import StackEntry, StacksFile, Weights
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.protocols import BlockListPredictor, CheckerName, StabilityChecker, StackSampler
 from stackgen.sampling.alignment import AlignedSampler
@@ -159,7 +159,7 @@ class Model:
         entries = []
         for found in choice.chosen:
             if checker is self.checker:
-                entry = Entry(found.stack, found.verdict, found.front_iou if found.verdict.stable else 0.0)
+                entry = StackEntry(found.stack, found.verdict, found.front_iou if found.verdict.stable else 0.0)
             else:
                 entry = check(self.checker, found.stack, mask, self.world.grid)
             entries.append(replace(entry, comment="" if found.verdict.stable else "nothing stable was found for it"))
@@ -171,7 +171,7 @@ class Model:
 
     def _file(
         self,
-        entries: tuple[Entry, ...],
+        entries: tuple[StackEntry, ...],
         silhouette: Silhouette,
         mask: Mask,
         counts: NDArray[np.int64],
@@ -182,8 +182,7 @@ class Model:
         physics = getattr(self.checker, "physics", None)
         return StacksFile(
             entries,
-            self.world.catalogue,
-            self.world.grid,
+            self.world,
             target=mask,
             silhouette=Path(silhouette).name if isinstance(silhouette, str | Path) else None,
             block_list=counts,
@@ -296,12 +295,12 @@ class Model:
         return Physics.of_world(dataset.get("physics"))
 
 
-def check(checker: StabilityChecker, stack: Stack, target: Mask | None, grid: Grid) -> Entry:
+def check(checker: StabilityChecker, stack: Stack, target: Mask | None, grid: Grid) -> StackEntry:
     """Simulate a stack; compare what then stands with a target (H, W). What falls has IoU 0 (SPEC, "IoU")."""
     verdict = checker.check(stack)
     if target is None:
-        return Entry(stack, verdict)
-    return Entry(stack, verdict, silhouette_iou(verdict.settled, target, grid=grid) if verdict.stable else 0.0)
+        return StackEntry(stack, verdict)
+    return StackEntry(stack, verdict, silhouette_iou(verdict.settled, target, grid) if verdict.stable else 0.0)
 
 
 def load(

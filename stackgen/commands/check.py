@@ -13,7 +13,7 @@ from rich.table import Table
 from stackgen.api import judge
 from stackgen.commands.parsing import Command, Files
 from stackgen.commands.tables import add_entries, verdict_table
-from stackgen.io.stacks_file import Entry, read_stacks, write_stacks
+from stackgen.io.stacks_file import StackEntry, read_stacks, write_stacks
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
 
@@ -34,11 +34,11 @@ def main(
     """
     content = read_stacks(file)
     physics = replace(Physics.of_world(content.physics, physics), cell_size=content.cell_size)
-    checker = SimulatorChecker(physics, content.catalogue)
+    checker = SimulatorChecker(physics, content.world.catalogue)
     judged = replace(
         content,
         entries=tuple(
-            replace(judge(checker, entry.stack, content.target, content.grid), comment=entry.comment)
+            replace(judge(checker, entry.stack, content.target, content.world.grid), comment=entry.comment)
             for entry in content.entries
         ),
         physics=physics.to_json(),
@@ -55,7 +55,7 @@ def main(
     return 0 if all(entry.verdict and entry.verdict.stable for entry in judged.entries) else 1
 
 
-def _explained(entries: Sequence[Entry], physics: Physics) -> tuple[tuple[Entry, ...], Table]:
+def _explained(entries: Sequence[StackEntry], physics: Physics) -> tuple[tuple[StackEntry, ...], Table]:
     """The entries with margins, and what statics says of each beside the simulator's verdict."""
     from stackgen.sim.statics.checker import EquilibriumChecker  # loads a solver that nothing else needs
 

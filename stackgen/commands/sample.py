@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
@@ -19,7 +16,7 @@ from stackgen.api import DEFAULT, load
 from stackgen.commands.parsing import Command, Files
 from stackgen.commands.tables import add_entries, verdict_table
 from stackgen.errors import StackgenError
-from stackgen.io.files import require_folder
+from stackgen.io.files import require_folder, staged
 from stackgen.io.stacks_file import StacksFile, write_stacks
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.protocols import CheckerName
@@ -146,39 +143,16 @@ def result_folders(images: Sequence[Path], out: Path) -> list[Path]:
 def write_result(result: StacksFile, folder: Path) -> Picture:
     """Write stacks.json, stacks.png and stack-N.glb, all of them or none; return the contact sheet."""
     assert result.block_list is not None
-    title = f"{result.silhouette}: {format_block_list(result.block_list, result.catalogue)}"
+    title = f"{result.silhouette}: {format_block_list(result.block_list, result.world.catalogue)}"
     verdicts = [entry.verdict for entry in result.entries]
     ious = [entry.front_iou for entry in result.entries]
-    sheet = contact_sheet(result.target, result.stacks, verdicts, ious, title, grid=result.grid)
-    with staged(folder) as stage:
+    sheet = contact_sheet(result.target, result.stacks, verdicts, ious, title, grid=result.world.grid)
+    with staged(folder, replaces="stack-[0-9]*.glb") as stage:
         for number, stack in enumerate(result.stacks, 1):
             write_glb(stage / f"stack-{number}.glb", stack, cell_size=result.cell_size)
         save_image(stage / "stacks.png", sheet)
         write_stacks(stage / "stacks.json", result)
     return sheet
-
-
-@contextmanager
-def staged(folder: Path) -> Iterator[Path]:
-    """A temporary folder whose files move to `folder` when all are written, and vanish otherwise.
-
-    GLBs of an earlier, larger result in the same folder are removed then.
-    """
-    new = not folder.exists()
-    folder.mkdir(parents=True, exist_ok=True)
-    stage = Path(tempfile.mkdtemp(prefix=".stackgen-", dir=folder))
-    try:
-        yield stage
-        files = {file.name: file for file in stage.iterdir()}
-        for old in folder.glob("stack-[0-9]*.glb"):
-            if old.name not in files:
-                old.unlink()
-        for name, file in files.items():
-            os.replace(file, folder / name)
-    finally:
-        shutil.rmtree(stage, ignore_errors=True)
-        if new and not any(folder.iterdir()):
-            folder.rmdir()
 
 
 COMMAND = Command(

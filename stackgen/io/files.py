@@ -6,6 +6,9 @@ import contextlib
 import json
 import os
 import secrets
+import shutil
+import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +16,7 @@ from stackgen.errors import StackgenError
 
 
 def write_atomically(path: str | Path, data: bytes) -> None:
-    """Write `data` under a temporary name in the same folder, made if missing, then put it in the place of `path`.
+    """Write a file whole or not at all: under a temporary name in its folder, made if missing, then in its place.
 
     Raises:
         StackgenError: If the folder cannot be made, is not writable or full; `path` is then as it was before.
@@ -45,15 +48,40 @@ def write_json(path: str | Path, content: Any, indent: int | None = 1) -> None:
     write_atomically(path, (json.dumps(content, indent=indent, allow_nan=False) + "\n").encode())
 
 
+@contextlib.contextmanager
+def staged(folder: Path, replaces: str) -> Iterator[Path]:
+    """Give a temporary folder whose files move to `folder` when the block ends, and vanish when it fails.
+
+    Args:
+        folder: Folder of the files, made if missing.
+        replaces: Pattern of the files of an earlier result that are removed unless they are written again.
+    """
+    new = not folder.exists()
+    folder.mkdir(parents=True, exist_ok=True)
+    stage = Path(tempfile.mkdtemp(prefix=".stackgen-", dir=folder))
+    try:
+        yield stage
+        names = {file.name for file in stage.iterdir()}
+        for old in folder.glob(replaces):
+            if old.name not in names:
+                old.unlink()
+        for name in names:
+            os.replace(stage / name, folder / name)
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+        if new and not any(folder.iterdir()):
+            folder.rmdir()
+
+
 def require_folder(folder: Path, asked: str) -> None:
-    """See that a folder is there, or can be made, and be written to.
+    """See that a folder is there or can be made, and can be written to.
 
     Args:
         folder: The folder.
-        asked: What the user asked for, with which the message begins.
+        asked: What the user asked for; the message begins with it.
 
     Raises:
-        StackgenError: If not.
+        StackgenError: If it cannot.
 
     >>> require_folder(Path("no-such-folder"), "--out no-such-folder")
     """
