@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import platform
 import resource
@@ -23,7 +22,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from stackgen.errors import StackgenError
-from stackgen.io.files import write_atomically
+from stackgen.io.files import write_json
 
 ROOT = Path(__file__).parents[1]
 FORMAT = "stackgen.benchmark/1"
@@ -169,7 +168,7 @@ def report(name: str, figures: Mapping[str, Any], tables: Sequence[Table], out: 
         "figures": figures,
     }
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(out, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
+    write_json(out, content)
     console.print(f"wrote {out}", highlight=False)
 
 

@@ -8,7 +8,6 @@ alone, warm; of verified sampling with the judge. Each row is printed and writte
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import statistics
 import time
@@ -20,7 +19,7 @@ import numpy as np
 
 from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.errors import StackgenError
-from stackgen.io.files import write_atomically
+from stackgen.io.files import write_json
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.protocols import Judge
 
@@ -101,7 +100,7 @@ def main() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `stackgen sample` has it; torch reads it when it is imported
     rows = rows_of(options)
     from stackgen.evaluation.protocol import load_scenes, physics_of
-    from stackgen.models.weights import load_sampler
+    from stackgen.sampling.methods import load_sampler
     from stackgen.sim.checkers import SimulatorChecker
 
     loaded: Any = load_sampler(options.weights)
@@ -129,7 +128,7 @@ def main() -> None:
         print(f"{number}/{len(rows)} {row.table}: {row.name}: {line}, {found['milliseconds']:.0f} ms", flush=True)
         if options.out is not None:
             options.out.parent.mkdir(parents=True, exist_ok=True)
-            write_atomically(options.out, (json.dumps(figures, indent=1) + "\n").encode())
+            write_json(options.out, figures)
     report("sampling", figures, tables(figures["rows"], len(scenes), options.num_samples), options.out)
 
 

@@ -22,7 +22,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from stackgen.errors import StackgenError
-from stackgen.io.files import write_atomically
+from stackgen.io.files import write_atomically, write_json
 from stackgen.world import World
 
 FORMAT = "stackgen.weights/1"
@@ -114,7 +114,7 @@ def write_weights(path: Path, tensors: dict[str, Tensor], card: dict[str, Any]) 
     content = save({name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()})
     full = {"format": FORMAT, "name": path.stem, **card, "sha256": hashlib.sha256(content).hexdigest()}
     write_atomically(path, content)
-    write_atomically(path.with_suffix(".json"), (json.dumps(full, indent=1) + "\n").encode())
+    write_json(path.with_suffix(".json"), full)
 
 
 def export_checkpoint(
