@@ -19,15 +19,16 @@ from rich.progress import track
 
 from benchmarks.common import argument_parser, peak_rss_mb, plain_table, report, start
 from stackgen.data.generation.deconstruction import Judge, Settled, deconstruct, surely_falls
+from stackgen.data.generation.designs import draw_design, realize
 from stackgen.data.generation.generate import GenerateSettings, template_samples
-from stackgen.data.generation.templates import draw_template, realize
 from stackgen.data.shards import Sample, encode_shard
 from stackgen.errors import StackgenError
 from stackgen.evaluation.intervals import clustered_ratio
 from stackgen.sim.checkers import AcceptLimits, accept, fell
 from stackgen.sim.simulator import Rollout, Simulator
-from stackgen.sim.statics.plane import Certificate, Outcome
+from stackgen.sim.statics.plane import StaticsMargins, Outcome
 from stackgen.stack import Stack
+from stackgen.world import PAPER_WORLD
 
 EVERY = 3
 """Of so many templates one is simulated throughout, too."""
@@ -76,7 +77,7 @@ def main() -> None:
     if options.templates < EVERY:
         raise StackgenError(f"--templates must be at least {EVERY}")
     settings = GenerateSettings("benchmark", 1, seed=options.seed)
-    plain = replace(settings, settle_twice=False, certificate=Certificate(enabled=False))
+    plain = replace(settings, settle_twice=False, certificate=StaticsMargins(enabled=False))
     numbers = range(options.templates)
     families, cost = made(settings, numbers, "making")
     _, simulated = made(plain, numbers[::EVERY], "simulating everything")
@@ -128,10 +129,10 @@ def decisions(settings: GenerateSettings, numbers: Sequence[int]) -> dict[str, A
     counts = {word: {"number": 0, "not_accepted": 0, "fell": 0} for word in ("stands", "falls", "unsure")}
     wrong: list[dict[str, Any]] = []
     limits = AcceptLimits()
-    with Simulator(settings.physics, settings.catalogue) as simulator:
+    with Simulator(settings.physics) as simulator:
         for number in track(numbers, "asking the simulator, too", transient=True):
             rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
-            design = realize(draw_template(rng, settings.template), rng, settings.template)
+            design = realize(draw_design(rng, PAPER_WORLD, settings.template), rng, PAPER_WORLD, settings.template)
             judge = Recording(simulator, settings.accept, settings.settle_twice, settings.certificate)
             list(deconstruct(design, judge, settings.max_removals))
             for stack, word in judge.said:

@@ -98,18 +98,18 @@ def make_dataset(folder: Path, stacks: int) -> None:
     """A dataset of copies of one shard that holds the stacks of testset-v1 four times."""
     from dataclasses import replace
 
-    from stackgen.data.datamodule import TESTSET
-    from stackgen.data.shards import Manifest, write_shard
+    from stackgen.data.dataset import TESTSET, Dataset
+    from stackgen.data.shards import write_shard
 
-    manifest = Manifest.load(TESTSET)
-    scenes = list(manifest.samples(TESTSET, "test"))
+    testset = Dataset.open(TESTSET)
+    scenes = list(testset.samples("test"))
     samples = [replace(scene, key=f"{i}{scene.key}") for i in range(SHARD // len(scenes)) for scene in scenes]
     first = write_shard(folder / "train-000000.tar", samples)
     names = [f"train-{number:06d}.tar" for number in range(-(-stacks // SHARD))]
     for name in names[1:]:
         shutil.copyfile(folder / names[0], folder / name)
     entries = tuple({**first, "file": name} for name in names)
-    replace(manifest, name="streams", shards=entries).save(folder)
+    replace(testset.manifest, name="streams", shards=entries).save(folder)
 
 
 def measure(options: argparse.Namespace, path: str) -> dict[str, Any]:
@@ -142,23 +142,23 @@ def cpu_seconds() -> float:
 
 def reader(options: argparse.Namespace, path: str) -> tuple[int, Callable[[], int]]:
     """The number of stacks, and a function that reads them once and answers how many it saw."""
-    from stackgen.data.loading.arrays import load_dataset
+    from stackgen.data.dataset import Dataset
     from stackgen.data.loading.cached import CachedLoader
     from stackgen.data.loading.streaming import ExactStream, TrainingStream
-    from stackgen.data.shards import Manifest
 
     folder, kind = str(options.data), path.partition(",")[0]
-    count = Manifest.load(folder).count("train")
+    dataset = Dataset.open(folder)
+    count = dataset.manifest.count("train")
     if kind == "fill":
-        return count, lambda: len(load_dataset(folder, ("train",))[0]["train"])
+        return count, lambda: len(Dataset.open(folder).split("train"))
     loader: Iterable[Any]
     if kind == "cached":
-        arrays = load_dataset(folder, ("train",))[0]["train"]
+        arrays = dataset.split("train")
         loader = CachedLoader(arrays, options.batch_size, train=True, **PATHS[path])
     elif kind == "stream":
-        loader = TrainingStream(folder, options.batch_size, **PATHS[path])
+        loader = TrainingStream(Dataset.open(dataset), options.batch_size, **PATHS[path])
     else:
-        loader = ExactStream(folder, "train", options.batch_size, **PATHS[path])
+        loader = ExactStream(Dataset.open(dataset), "train", options.batch_size, **PATHS[path])
     return count, lambda: sum(len(batch["template"]) for batch in loader)
 
 

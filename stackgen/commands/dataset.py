@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -15,11 +14,12 @@ from rich.table import Table
 from stackgen.commands.parsing import Command, Files, epilog
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.data.card import write_card
+from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.data.generation.executors import ExecutorName
+from stackgen.data.manifest import SPLITS, Manifest
 from stackgen.data.resplit import By, Resplit, resplit, split_table
-from stackgen.data.shards import SPLITS, Manifest
 from stackgen.errors import StackgenError
-from stackgen.io.files import write_atomically
+from stackgen.io.files import write_json
 
 TRAVELS = 64 * 2**20
 """Largest compact file that is easy to send along [byte]."""
@@ -33,7 +33,7 @@ def verify(folder: Path) -> int:
     """
     from stackgen.data.inspection.verify import verify as find_problems
 
-    manifest = Manifest.load(folder)
+    manifest = Dataset.open(folder).manifest
     with progress_bar("verifying", len(manifest.shards)) as (advance, _):
         problems = find_problems(folder, advance)
     if not problems:
@@ -92,7 +92,7 @@ def info(folder: Path, out: Path | None = None, margins: int = 500, samples: int
     if margins < 0 or samples < 0:
         raise StackgenError("dataset info: margins and samples must be at least 0")
     contents = Contents.load(folder)
-    found = facts(contents, None if folder.resolve() == _testset().resolve() else _testset())
+    found = facts(contents, None if folder.resolve() == TESTSET.resolve() else TESTSET)
     held = None
     if margins:
         held = sample_margins(contents, _statics(contents.manifest), margins, seed)
@@ -102,7 +102,7 @@ def info(folder: Path, out: Path | None = None, margins: int = 500, samples: int
     if place is None:
         return
     place.mkdir(parents=True, exist_ok=True)
-    write_atomically(place / "info.json", (json.dumps(found, indent=1, allow_nan=False) + "\n").encode())
+    write_json(place / "info.json", found)
     draw_facts(place / "info.png", contents, found, held)
     written = ["info.json", "info.png"]
     if samples:
@@ -132,7 +132,7 @@ def split(
         seed: Another one, another choice.
         out: Folder of the new dataset; without it the present split is printed.
     """
-    manifest = Manifest.load(folder)
+    manifest = Dataset.open(folder).manifest
     asked = validation is not None or test is not None
     if asked != (out is not None):
         raise StackgenError("dataset split: a new split needs --out and one of --validation and --test")
@@ -159,28 +159,23 @@ def export(folder: Path, out: Path) -> None:
         folder: Of the dataset.
         out: File to write, ending in .npz; `--data.path` takes it.
     """
-    from stackgen.data.loading.arrays import load_dataset, save_npz
+    from stackgen.data.compact import save_npz
 
-    splits, facts = load_dataset(folder)
-    save_npz(out, splits, facts)
+    dataset = Dataset.open(folder)
+    splits = {name: dataset.split(name) for name in dataset.splits}
+    save_npz(out, splits, dataset.manifest)
     size = out.stat().st_size
     large = "" if size <= TRAVELS else f" (more than the {TRAVELS / 2**20:g} MiB that are easy to send along)"
     print(f"wrote {out}: {sum(map(len, splits.values())):,} stacks, {size / 2**20:.1f} MiB{large}")
 
 
-def _testset() -> Path:
-    from stackgen.data.generation.generate import TESTSET
-
-    return TESTSET
-
-
 def _statics(manifest: Manifest) -> Any:
     """Statics with the friction that the dataset was made with."""
     from stackgen.sim.physics import Physics
-    from stackgen.sim.statics.checker import EquilibriumChecker  # loads a solver that nothing else needs
+    from stackgen.sim.statics.checker import StaticsChecker  # loads a solver that nothing else needs
 
     friction = manifest.physics.get("friction", Physics().friction)
-    return EquilibriumChecker(Physics(friction=float(friction)))
+    return StaticsChecker(Physics(friction=float(friction)))
 
 
 def _print_facts(found: Mapping[str, Any]) -> None:
@@ -234,9 +229,6 @@ COMMANDS = {
         files=_FOLDER,
     ),
 }
-
-EXAMPLES = {name: command.example for name, command in COMMANDS.items()}
-
 
 EXAMPLES = {action: command.example for action, command in COMMANDS.items()}
 

@@ -10,7 +10,7 @@ from stackgen.commands.parsing import Command
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.data.generation.executors import ExecutorName, make_executor
 from stackgen.data.generation.generate import GenerateSettings, generate, generate_range
-from stackgen.data.shards import SPLITS
+from stackgen.data.manifest import SPLITS
 from stackgen.errors import StackgenError
 
 
@@ -71,7 +71,7 @@ COMMAND = Command(
     stackgen generate --name small --stacks 2000 --seed 7 --out data/small --workers 2
     stackgen generate --config configs/generate/paper.yaml --out data/paper --shard_range 0:40
     """,
-    settings=("settings", GenerateSettings),
+    settings={"settings": GenerateSettings},
 )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from stackgen.data.shards import FORMAT, SPLITS, Manifest
+from stackgen.data.manifest import FORMAT, SPLITS, Manifest
 from stackgen.io.files import write_atomically
 
 CARD = "README.md"
@@ -57,7 +57,7 @@ def dataset_card(manifest: Manifest, measured: Sequence[str] = ()) -> str:
     """The text of a card, Markdown."""
     stacks = sum(manifest.count(split) for split in SPLITS)
     example = manifest.shards[0]["file"] if manifest.shards else "train-000000.tar"
-    reading = _READING.format(shard=example, pixels=manifest.grid.image_size)
+    reading = _READING.format(shard=example, pixels=manifest.world.grid.image_size)
     sections = {
         "": _about(manifest, stacks),
         "Counts": markdown_table(
@@ -94,9 +94,9 @@ def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> st
 
 
 def _about(manifest: Manifest, stacks: int) -> str:
-    grid = manifest.grid
+    grid = manifest.world.grid
     return (
-        f"{stacks:,} stacks of at most {manifest.max_blocks} blocks on a {grid.width} x {grid.height} grid, each "
+        f"{stacks:,} stacks of at most {manifest.world.max_blocks} blocks on a {grid.width} x {grid.height} grid, each "
         f"settled in a physics simulator, with its front silhouette ({grid.image_size} x {grid.image_size} pixels, "
         f"{grid.pixels_per_cell:g} a cell). For learning to build a stable structure of a given silhouette. "
         "The checksum of every shard is in `dataset.json`."
@@ -108,10 +108,11 @@ def _making(manifest: Manifest) -> str:
     if "template" not in s:
         return "`dataset.json` does not say."
     fill, shift = s["template"]["minimum_fill"], s["template"]["displacement"]
+    width = manifest.world.grid.width
     accept, twice = s["accept"], " twice" if s.get("settle_twice") else ""
     lines = [
         f"By construction and deconstruction, seed {manifest.seed}. Rows are filled from the bottom with random blocks "
-        f"until at least {fill} of {manifest.grid.width} cells are occupied; each block is shifted along x within "
+        f"until at least {fill} of {width} cells are occupied; each block is shifted along x within "
         f"{shift:g} cell. The design is simulated{twice} and kept if it comes to rest, no block moved by more than "
         f"{accept['displacement']:g} cell along an axis or leaned by more than {accept['tilt']:g} rad. From what "
         f"stands, up to {s['max_removals']} blocks are removed one at a time, and each rest is judged in the same way."
@@ -136,7 +137,7 @@ def _making(manifest: Manifest) -> str:
 def _blocks(manifest: Manifest) -> str:
     rows = [
         [f"{index}: {shape.name}", *(f"{extent:g}" for extent in shape.size), f"{shape.volume:g}"]
-        for index, shape in enumerate(manifest.catalogue)
+        for index, shape in enumerate(manifest.world.catalogue)
     ]
     return markdown_table(["shape", "width [cell]", "depth [cell]", "height [cell]", "volume [cell^3]"], rows)
 

@@ -2,7 +2,7 @@
 
 The whole of a paper-sized dataset is 150 MB as arrays, so it is held in memory (on the accelerator,
 where there is one) and batches are gathered there; streaming is for what does not fit.
-What a batch holds: :meth:`stackgen.data.loading.arrays.StackTensors.batch`.
+What a batch holds: :meth:`stackgen.data.arrays.StackTensors.batch`.
 """
 
 from __future__ import annotations
@@ -16,20 +16,14 @@ import torch
 from numpy.typing import NDArray
 
 from stackgen._lightning import pl
-from stackgen.data.loading.arrays import Batch, StackArrays, load_dataset
+from stackgen.data.arrays import Batch, StackArrays
+from stackgen.data.dataset import TESTSET, Dataset
+from stackgen.data.decoding import SkipLog, bytes_per_sample, read_decoded
 from stackgen.data.loading.cached import CachedLoader
-from stackgen.data.loading.decoding import Frame
 from stackgen.data.loading.epochs import Epochs
-from stackgen.data.loading.losses import Losses, read_decoded
-from stackgen.data.shards import Manifest, Split
-from stackgen.data.sources import is_folder, load_manifest, shards_of
+from stackgen.data.manifest import Manifest, Split
 from stackgen.errors import StackgenError
-from stackgen.world import Catalogue, Grid
-
-__all__ = ["TESTSET", "CachedLoader", "StackDataModule"]
-
-TESTSET = Path(__file__).parents[1] / "assets" / "testset-v1"
-"""The frozen test scenes that every method is measured on."""
+from stackgen.world import World
 
 STATISTICS_SHARDS = 8
 """Shards, spread over the split, from which a stream learns the scale of the poses."""
@@ -42,17 +36,17 @@ class StackDataModule(pl.LightningDataModule):
         path: Dataset folder or compact `.npz` file; also behind a URL (`s3://`, `https://`, ...) or a command
             (`pipe:ssh host cat data/{file}`).
         batch_size: Samples a batch, on each process.
-        mode: `cached` holds the splits in memory, filled once; `stream` reads shards as it goes; `auto`
+        mode: Where batches come from: `cached` holds the splits in memory, `stream` reads shards as it goes, `auto`
             caches what takes no more than `cache_gb`.
-        cache_gb: See `mode`; training and validation split together, on each process [GB].
+        cache_gb: Memory for the training and validation split together, on each process [GB].
         num_workers: Reading processes, where data are streamed.
-        bucket_by_blocks: Training batches of stacks with one number of blocks (nearly one, where they are
+        bucket_by_blocks: Whether a training batch holds stacks with one number of blocks (nearly one, where they are
             streamed), padding trimmed.
-        mirror: Reflect training samples at x = 0 half of the time.
-        samples_per_epoch: Of training, over all processes; by default as many as there are.
-        eval_batch_size: Of validation and test; by default `batch_size`.
+        mirror: Whether to reflect training samples at x = 0 half of the time.
+        samples_per_epoch: Training samples an epoch, over all processes; by default as many as there are.
+        eval_batch_size: Batch size of validation and test; by default `batch_size`.
         test_path: Dataset of the test split; by default the frozen `testset-v1`.
-        seed: Of shuffling and reflections.
+        seed: Seed of shuffling and reflections.
 
     Raises:
         StackgenError: If the options do not fit each other.
@@ -83,43 +77,40 @@ class StackDataModule(pl.LightningDataModule):
         self.batch_size, self.eval_batch_size = batch_size, eval_batch_size or batch_size
         self.mode, self.cache_gb, self.num_workers, self.seed = mode, cache_gb, num_workers, seed
         self.bucket_by_blocks, self.mirror, self.samples_per_epoch = bucket_by_blocks, mirror, samples_per_epoch
-        self.splits: dict[str, StackArrays] = {}
-        self._facts: dict[str, dict[str, Any]] = {}  # manifests as plain data, by path
-        self._manifests: dict[str, Manifest] = {}
+        self._datasets: dict[str, Dataset] = {}
         self._training: Epochs | None = None
         self._resume: dict[str, Any] | None = None
 
     @property
-    def manifest(self) -> dict[str, Any]:
-        """The dataset's manifest as plain data."""
-        return self._manifest_of(self.path, "train", "validation")
+    def dataset(self) -> Dataset:
+        """The dataset of the training and validation split."""
+        return self._open(self.path)
 
     @property
-    def test_manifest(self) -> dict[str, Any]:
-        """The manifest of the dataset whose test split is used."""
-        return self._manifest_of(self.test_path, "test")
+    def test_dataset(self) -> Dataset:
+        """The dataset of the test split."""
+        return self._open(self.test_path)
 
     @property
-    def catalogue(self) -> Catalogue:
-        """What the shape indices mean."""
-        return Catalogue.from_json(self.manifest["catalogue"])
+    def manifest(self) -> Manifest:
+        """The dataset's manifest."""
+        return self.dataset.manifest
 
     @property
-    def grid(self) -> Grid:
-        """The scale of the silhouettes."""
-        return Grid(**self.manifest["grid"])
+    def world(self) -> World:
+        """Shapes, grid and longest block list of the dataset."""
+        return self.dataset.world
 
     def pose_statistics(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Mean (6,) and standard deviation (6,) of the training poses; when streaming, of a few shards'."""
         if self.is_cached("train"):
             return self.split("train").pose_statistics(self.mirror)
-        manifest, losses = self._manifest_object(self.path), Losses()
-        shards, frame = shards_of(manifest, self.path, "train"), Frame.of(manifest)
+        shards, log = self.dataset.shards("train"), SkipLog()
         parts = []
         for number in np.unique(np.linspace(0, len(shards) - 1, STATISTICS_SHARDS).astype(int)):
-            decoded, lost = read_decoded(shards[number], frame)
-            losses.add(lost)
-            parts.append(StackArrays.of(decoded, frame))
+            decoded, skipped = read_decoded(shards[number], self.world)
+            log.add(skipped)
+            parts.append(decoded.stacks)
         arrays = StackArrays.concatenate(parts)
         if not len(arrays):
             raise StackgenError(f"data: none of {len(parts)} training shards of {self.path} can be read")
@@ -127,37 +118,34 @@ class StackDataModule(pl.LightningDataModule):
 
     def is_cached(self, split: Split) -> bool:
         """Whether a split is held in memory; the same on every process and machine."""
-        path = self.test_path if split == "test" else self.path
-        if self.mode == "cached" or not is_folder(path):
+        dataset = self._of(split)
+        if self.mode == "cached" or dataset.is_compact:
             return True
         if self.mode == "stream":
             return False
-        manifest = self._manifest_object(path)
         splits: tuple[Split, ...] = ("train", "validation") if split == "train" else (split,)
-        samples = sum(map(manifest.count, splits))
-        return samples * Frame.of(manifest).bytes_per_sample <= self.cache_gb * 1e9
+        samples = sum(map(dataset.manifest.count, splits))
+        return samples * bytes_per_sample(dataset.world) <= self.cache_gb * 1e9
 
     def setup(self, stage: str) -> None:
         """Load what the stage needs."""
-        if self.mirror and not all(_is_symmetric(shape.outline) for shape in self.catalogue):
+        if self.mirror and not all(_is_symmetric(shape.outline) for shape in self.world.catalogue):
             raise StackgenError("data: mirror needs shapes whose outlines are symmetric; set mirror to false")
         if stage == "fit":
-            splits: tuple[Split, ...] = ("train", "validation")
-            if self.mode == "stream" and self.is_cached("train"):
+            if self.mode == "stream" and self.dataset.is_compact:
                 raise StackgenError(f"data: mode stream needs a dataset of shards; {self.path} is no such folder")
-            self._load(*(name for name in splits if self.is_cached(name)))
+            splits: tuple[Split, ...] = ("train", "validation")
+            for split in splits:
+                if self.is_cached(split) and split in self.dataset.splits:
+                    self.split(split)
 
-    def split(self, name: str) -> StackArrays:
-        """A split in memory.
+    def split(self, name: Split) -> StackArrays:
+        """Give a split in memory.
 
         Raises:
             StackgenError: If the dataset has no such split.
         """
-        if name not in self.splits:
-            self._load(name)
-        if name not in self.splits:
-            raise StackgenError(f"dataset {self.path} has no {name} split")
-        return self.splits[name]
+        return self._of(name).split(name)
 
     def train_dataloader(self) -> Epochs:
         """Shuffled batches."""
@@ -172,75 +160,63 @@ class StackDataModule(pl.LightningDataModule):
         if self.is_cached("train"):
             self._training = CachedLoader(self.split("train"), self.batch_size, train=True, **options)
         else:
-            from stackgen.data.loading.streaming import TrainingStream
+            from stackgen.data.loading.streaming import TrainingStream  # webdataset, which a cached run does without
 
-            self._training = TrainingStream(self.path, self.batch_size, num_workers=self.num_workers, **options)
+            self._training = TrainingStream(self.dataset, self.batch_size, num_workers=self.num_workers, **options)
         self._training.in_hand = self._in_hand
         if self._resume is not None:
             self._training.load_state_dict(self._resume)
             self._resume = None
-        if self._training.relaid and self.trainer is not None:
+        if self._training.is_leftover and self.trainer is not None:
             # The epoch under way has a length of its own: let Lightning ask again for the next one.
             self.trainer.reload_dataloaders_every_n_epochs = 1  # type: ignore[attr-defined]
         return self._training
 
     def val_dataloader(self) -> Iterable[Batch]:
         """The validation split once, in order."""
-        return self._exact_loader(self.path, "validation")
+        return self._exact_loader("validation")
 
     def test_dataloader(self) -> Iterable[Batch]:
         """The test split once, in order."""
-        return self._exact_loader(self.test_path, "test")
+        return self._exact_loader("test")
 
     def predict_dataloader(self) -> Iterable[Batch]:
         """The same as for the test."""
         return self.test_dataloader()
 
     def state_dict(self) -> dict[str, Any]:
-        """Where training is, for checkpoints."""
+        """Say where training is, for checkpoints."""
         return {} if self._training is None else {"training": self._training.state_dict()}
 
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Let training continue from there; before Lightning asks how long an epoch is."""
+        self._resume = state.get("training")
+
     def _in_hand(self) -> bool:
-        """Whether training stopped in the middle of a step, as by Ctrl-C."""
+        """Whether training stopped in the middle of a step, as by Ctrl-C.
+
+        Lightning does not say so itself; these parts of its loop are pinned by a test.
+        """
         if self.trainer is None:
             return False
         batches = self.trainer.fit_loop.epoch_loop.batch_progress.current
         return batches.ready > batches.processed  # type: ignore[attr-defined]
 
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Let training go on from there; before Lightning asks how long an epoch is."""
-        self._resume = state.get("training")
-
-    def _exact_loader(self, path: str, split: Split) -> Iterable[Batch]:
+    def _exact_loader(self, split: Split) -> Iterable[Batch]:
         if self.is_cached(split):
             return CachedLoader(self.split(split), self.eval_batch_size, train=False, device=self._device)
         from stackgen.data.loading.streaming import ExactStream
 
-        return ExactStream(path, split, self.eval_batch_size, num_workers=self.num_workers, device=self._device)
+        options = {"num_workers": self.num_workers, "device": self._device}
+        return ExactStream(self._of(split), split, self.eval_batch_size, **options)  # type: ignore[arg-type]
 
-    def _load(self, *names: str) -> None:
-        """Read splits, all that are missing from one file at once."""
-        missing = [name for name in names if name not in self.splits]
-        ours = [name for name in missing if name != "test"]
-        if ours:
-            found, self._facts[self.path] = load_dataset(self.path, ours)
-            self.splits.update(found)
-        if "test" in missing:
-            found, self._facts[self.test_path] = load_dataset(self.test_path, ("test",))
-            self.splits.update(found)
+    def _of(self, split: str) -> Dataset:
+        return self.test_dataset if split == "test" else self.dataset
 
-    def _manifest_of(self, path: str, *splits: str) -> dict[str, Any]:
-        if path not in self._facts:
-            if is_folder(path):
-                self._facts[path] = self._manifest_object(path).to_json()
-            else:
-                self._load(*splits)
-        return self._facts[path]
-
-    def _manifest_object(self, path: str) -> Manifest:
-        if path not in self._manifests:
-            self._manifests[path] = load_manifest(path)
-        return self._manifests[path]
+    def _open(self, path: str) -> Dataset:
+        if path not in self._datasets:
+            self._datasets[path] = Dataset.open(path)
+        return self._datasets[path]
 
     def _epoch(self) -> Callable[[], int] | None:
         trainer = self.trainer

@@ -8,7 +8,6 @@ Legend: P pairs, N blocks at most, n samples a scene.
 
 from __future__ import annotations
 
-import io
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.data.arrays import PADDING, StackArrays
+from stackgen.data.compact import write_npz
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
-from stackgen.io.files import write_atomically
 from stackgen.protocols import StabilityChecker, StackSampler
 
 _SCENES_AT_ONCE = 128
@@ -57,9 +56,7 @@ class Preferences:
         if path.suffix != ".npz":
             raise StackgenError(f"preferences are written to a .npz file, not {path.name}")
         shared = {name: getattr(self.better, name) for name in ("shapes", "silhouettes", "template", "num_shapes")}
-        file = io.BytesIO()
-        np.savez_compressed(file, allow_pickle=False, better=self.better.poses, worse=self.worse.poses, **shared)
-        write_atomically(path, file.getvalue())
+        write_npz(path, {"better": self.better.poses, "worse": self.worse.poses, **shared})
 
     @staticmethod
     def load(path: str | Path) -> Preferences:
@@ -120,7 +117,8 @@ def prefer(
         samples = sampler.sample_batch(targets, stacks.counts[part], num_samples, seed * 1_000_003 + start)
         verdicts = iter(checker.check_all([stack for drawn in samples for stack in drawn]))
         for row, target, drawn in zip(part.tolist(), targets, samples, strict=True):
-            successes, failures = [], []
+            successes: list[NDArray[np.float64]] = []
+            failures: list[NDArray[np.float64]] = []
             for stack in drawn:
                 verdict = next(verdicts)
                 good = verdict.stable and silhouette_iou(verdict.settled, target, sampler.world.grid) >= iou

@@ -11,10 +11,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 from stackgen.data.card import write_card
-from stackgen.data.generation.templates import Template
-from stackgen.data.shards import SPLITS, Manifest, Sample, Split, read_shard, split_of, write_shard
+from stackgen.data.dataset import Dataset
+from stackgen.data.generation.designs import Design
+from stackgen.data.manifest import SPLITS, Manifest, Split, split_of
+from stackgen.data.shards import Sample, read_shard, write_shard
 from stackgen.errors import StackgenError
-from stackgen.world import Catalogue, Grid
+from stackgen.world import World
 
 By = Literal["template", "layout"]
 
@@ -57,7 +59,7 @@ def resplit(folder: Path, out: Path, how: Resplit, progress: Callable[[int], Non
     Raises:
         StackgenError: If there is no dataset, a shard is damaged, or `out` is there already.
     """
-    manifest = Manifest.load(folder)
+    manifest = Dataset.open(folder).manifest
     if out.exists():
         raise StackgenError(f"{out} is there already: choose another folder")
     workshop = out.with_name(f".{out.name}.unfinished")
@@ -115,18 +117,18 @@ def _group(sample: Sample, by: By, manifest: Manifest) -> Any:
     """What a sample shares with those it must stay with."""
     if by == "template":
         return sample.meta["template"]
-    design = _canonical(sample.meta.get("layout"), manifest.catalogue, manifest.grid)
+    design = _canonical(sample.meta.get("layout"), manifest.world)
     if design is None:
         raise StackgenError(f"sample {sample.key} does not say its layout: this dataset can only be split by template")
     return design
 
 
 @lru_cache(maxsize=100_000)
-def _canonical(layout: str | None, catalogue: Catalogue, grid: Grid) -> str | None:
+def _canonical(layout: str | None, world: World) -> str | None:
     """One text for a design and its mirror image; None if there is no design."""
     try:
-        design = Template.from_key(layout or "")
-        return min(design.key, design.mirrored(catalogue, grid).key)
+        design = Design.from_key(layout or "")
+        return min(design.key, design.mirrored(world).key)
     except (ValueError, IndexError):
         return None
 
@@ -146,7 +148,7 @@ def split_table(
     for read, (entry, samples) in enumerate(zip(manifest.shards, _shards(folder, manifest), strict=True), 1):
         for sample in samples:
             templates[entry["split"]].add(sample.meta["template"])
-            designs[entry["split"]].add(_canonical(sample.meta.get("layout"), manifest.catalogue, manifest.grid))
+            designs[entry["split"]].add(_canonical(sample.meta.get("layout"), manifest.world))
         if progress:
             progress(read)
     for known in designs.values():

@@ -3,54 +3,54 @@
 - a local path;
 - a URL that fsspec knows, `s3://bucket/data/paper` or `https://host/data/paper`, below which the files
   have the names they have in a folder;
-- `pipe:COMMAND`, a shell command whose output is the file; `{file}` in it stands for a file's name,
-  as in `pipe:ssh host cat data/paper/{file}`.
+- `pipe:COMMAND`, a shell command whose output is the file, as webdataset runs it; `{file}` in it stands
+  for a file's name, as in `pipe:ssh host cat data/paper/{file}`.
 
-The manifest is the file `dataset.json` there, the shards are those it names.
+Everybody else opens a :class:`stackgen.data.dataset.Dataset`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import re
-import subprocess
 import time
 from pathlib import Path
-from typing import Any
 
-from stackgen.data.shards import Manifest, Split
+from stackgen.data.manifest import ShardEntry
 from stackgen.errors import StackgenError
 
 PIPE = "pipe:"
-PLACE_OF_FILE = "{file}"
+FILE_NAME = "{file}"
+"""Stands for the name of a file in a command."""
+
 WAITS = (0.2, 1.0)
-"""Before what could not be fetched from afar is asked for again [s]."""
+"""Pauses before a file that could not be fetched from afar is asked for again [s]."""
 
 _PLAIN_NAME = re.compile(r"\w[\w.-]*")  # nothing that a shell, a URL or a path would read as more than a name
 
 
-def is_remote(path: str | Path) -> bool:
-    """Whether a path is a URL or a pipe.
+def is_remote(path: str) -> bool:
+    """Tell whether a path is a URL or a command.
 
     >>> is_remote("data/paper"), is_remote("s3://bucket/data"), is_remote("pipe:cat data/{file}")
     (False, True, True)
     """
-    return str(path).startswith(PIPE) or "://" in str(path)
+    return path.startswith(PIPE) or "://" in path
 
 
-def is_folder(path: str | Path) -> bool:
-    """Whether a path stands for a manifest and shards; otherwise for one compact file.
+def is_folder(path: str) -> bool:
+    """Tell whether a path stands for a manifest and shards; otherwise it is one compact file.
 
     >>> is_folder("https://host/data"), is_folder("https://host/data.npz"), is_folder("pipe:cat data.npz")
     (True, False, False)
     """
     if not is_remote(path):
         return Path(path).is_dir()
-    return PLACE_OF_FILE in str(path) if str(path).startswith(PIPE) else not str(path).endswith(".npz")
+    return FILE_NAME in path if path.startswith(PIPE) else not path.endswith(".npz")
 
 
-def locate(root: str | Path, name: str) -> str:
-    """Where a file of the dataset at `root` lies.
+def locate(root: str, name: str) -> str:
+    """Say where a file of the dataset at `root` lies.
 
     Raises:
         StackgenError: If `name` is not the plain name of a file.
@@ -60,21 +60,21 @@ def locate(root: str | Path, name: str) -> str:
     """
     if not _PLAIN_NAME.fullmatch(name):
         raise StackgenError(f"dataset {root}: its manifest names a file {name!r}, which is not a plain file name")
-    if str(root).startswith(PIPE):
-        return str(root).replace(PLACE_OF_FILE, name)
-    return f"{str(root).rstrip('/')}/{name}" if is_remote(root) else str(Path(root) / name)
+    if root.startswith(PIPE):
+        return root.replace(FILE_NAME, name)
+    return f"{root.rstrip('/')}/{name}" if is_remote(root) else str(Path(root) / name)
 
 
-def read_bytes(path: str | Path) -> bytes:
-    """A whole file from wherever it lies.
+def read_bytes(path: str) -> bytes:
+    """Read a whole file from wherever it lies.
 
     Raises:
         StackgenError: If it cannot be read; one line.
     """
     try:
-        if str(path).startswith(PIPE):
-            return _output(str(path).removeprefix(PIPE))
-        return _fetch(str(path)) if is_remote(path) else Path(path).read_bytes()
+        if path.startswith(PIPE):
+            return _output(path)
+        return _fetch(path) if is_remote(path) else Path(path).read_bytes()
     except FileNotFoundError as error:
         raise StackgenError(f"there is no file {path}") from error
     except StackgenError:
@@ -84,30 +84,18 @@ def read_bytes(path: str | Path) -> bytes:
         raise StackgenError(f"{path} cannot be read: {reason}") from error
 
 
-def load_manifest(root: str | Path) -> Manifest:
-    """The manifest of a dataset, wherever it lies.
-
-    Raises:
-        StackgenError: If there is none, or it is not one of ours.
-    """
-    if not is_remote(root):
-        return Manifest.load(root)
-    where = locate(root, "dataset.json")
-    return Manifest.parse(read_bytes(where), where)
-
-
 class Shard:
     """One shard of a dataset, wherever that lies.
 
     Args:
-        root: Of the dataset.
-        entry: What the manifest says of it.
+        root: Path of the dataset.
+        entry: What the manifest says of the shard.
 
     Raises:
         StackgenError: If the manifest's entry is not complete.
     """
 
-    def __init__(self, root: str | Path, entry: dict[str, Any]) -> None:
+    def __init__(self, root: str, entry: ShardEntry) -> None:
         try:
             self.name, self.sha256, self.samples = str(entry["file"]), str(entry["sha256"]), int(entry["samples"])
         except (KeyError, TypeError, ValueError) as error:
@@ -115,7 +103,7 @@ class Shard:
         self.path = locate(root, self.name)
 
     def read(self) -> bytes:
-        """Its bytes, if they are those that were written; from afar they are asked for up to three times.
+        """Read its bytes, if they are those that were written; from afar they are asked for up to three times.
 
         Raises:
             StackgenError: If it is missing, cut short or altered; the message names it.
@@ -139,11 +127,6 @@ class Shard:
         return content
 
 
-def shards_of(manifest: Manifest, root: str | Path, split: Split) -> list[Shard]:
-    """The shards of a split, in order."""
-    return [Shard(root, entry) for entry in manifest.shards if entry["split"] == split]
-
-
 def _fetch(url: str) -> bytes:
     import fsspec  # type: ignore[import-untyped]  # only where something lies elsewhere
 
@@ -152,9 +135,12 @@ def _fetch(url: str) -> bytes:
     return files.cat_file(path)
 
 
-def _output(command: str) -> bytes:
-    done = subprocess.run(command, shell=True, stdin=subprocess.DEVNULL, capture_output=True, check=False)
-    if done.returncode:
-        complaint = (done.stderr.decode(errors="replace").strip().splitlines() or ["it printed no error"])[-1]
-        raise StackgenError(f"`{command}` ended with {done.returncode}: {complaint}")
-    return done.stdout
+def _output(url: str) -> bytes:
+    import webdataset  # only where something lies elsewhere
+
+    command = webdataset.gopen(url)
+    try:
+        with command:
+            return command.read()
+    except OSError as error:
+        raise StackgenError(f"`{url.removeprefix(PIPE)}` ended with exit code {command.status}") from error

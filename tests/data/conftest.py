@@ -7,11 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stackgen.data.generation.templates import draw_template, realize
-from stackgen.data.loading.arrays import StackArrays, load_dataset
-from stackgen.data.shards import Manifest, Sample, write_shard
+from stackgen.data.arrays import StackArrays
+from stackgen.data.dataset import Dataset
+from stackgen.data.generation.designs import draw_design, realize
+from stackgen.data.manifest import Manifest
+from stackgen.data.shards import Sample, write_shard
 from stackgen.geometry import silhouette
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID
+from stackgen.world import PAPER_GRID, PAPER_WORLD
 
 SHARDS = {"train-000000.tar": 41, "train-000001.tar": 30, "validation-000002.tar": 23, "test-000003.tar": 7}
 
@@ -25,13 +27,13 @@ def samples() -> dict[str, list[Sample]]:
     for name, count in SHARDS.items():
         made[name] = []
         while len(made[name]) < count:
-            design = draw_template(rng)
-            stack = realize(design, rng)
+            design = draw_design(rng, PAPER_WORLD)
+            stack = realize(design, rng, PAPER_WORLD)
             if len(stack) > 10:
                 continue
             meta = {"template": number, "layout": design.key, "removed": []}
             shapes, poses = stack.shapes.astype(np.uint8), stack.poses.astype(np.float32)
-            made[name].append(Sample(f"{number:07d}", shapes, poses, silhouette(stack), meta))
+            made[name].append(Sample(f"{number:07d}", shapes, poses, silhouette(stack, PAPER_GRID), meta))
             number += 1
     return made
 
@@ -41,11 +43,12 @@ def dataset(samples: dict[str, list[Sample]], tmp_path_factory: pytest.TempPathF
     """A dataset folder."""
     folder = tmp_path_factory.mktemp("dataset")
     shards = tuple(write_shard(folder / name, those) for name, those in samples.items())
-    Manifest("small", 0, PAPER_CATALOGUE, PAPER_GRID, 10, {"engine": "none"}, {}, shards).save(folder)
+    Manifest("small", 0, PAPER_WORLD, {"engine": "none"}, {}, shards).save(folder)
     return folder
 
 
 @pytest.fixture(scope="session")
 def splits(dataset: Path) -> dict[str, StackArrays]:
     """Its splits in memory."""
-    return load_dataset(dataset)[0]
+    found = Dataset.open(dataset)
+    return {name: found.split(name) for name in found.splits}

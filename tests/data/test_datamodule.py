@@ -16,12 +16,13 @@ import pytest
 import torch
 
 from stackgen._lightning import pl
+from stackgen.data.arrays import StackArrays
+from stackgen.data.compact import save_npz
 from stackgen.data.datamodule import StackDataModule
-from stackgen.data.loading.arrays import StackArrays, save_npz
+from stackgen.data.decoding import bytes_per_sample
 from stackgen.data.loading.cached import CachedLoader
-from stackgen.data.loading.decoding import Frame
-from stackgen.data.shards import Manifest
 from stackgen.errors import StackgenError
+from stackgen.world import PAPER_WORLD
 
 
 def _place(rank: int, world: int = 3) -> tuple[int, int]:
@@ -97,7 +98,7 @@ def test_epochs_of_another_length_are_cut_from_one_row_of_passes(splits: dict[st
 def test_ranks_of_a_loader_do_not_overlap(splits: dict[str, StackArrays]) -> None:
     for train in (True, False):
         shares = [
-            visited(CachedLoader(splits["train"], 8, train=train, place=partial(_place, rank))) for rank in range(3)
+            visited(CachedLoader(splits["train"], 8, train=train, rank=partial(_place, rank))) for rank in range(3)
         ]
         together = [t for share in shares for t in share]
         assert len(together) == len(set(together))
@@ -111,7 +112,7 @@ def test_validation_and_test_visit_every_sample_once_in_order(
     data.setup("fit")
     assert visited(data.val_dataloader()) == splits["validation"].template.tolist()
     assert visited(data.test_dataloader()) == splits["test"].template.tolist()
-    assert data.catalogue.names[0] == "cube" and data.grid.image_size == 64
+    assert data.world.catalogue.names[0] == "cube" and data.world.grid.image_size == 64
     save_npz(tmp_path / "d.npz", splits, data.manifest)
     compact = StackDataModule(tmp_path / "d.npz", batch_size=10)
     assert compact.manifest == data.manifest
@@ -124,7 +125,7 @@ def test_validation_and_test_visit_every_sample_once_in_order(
         ({"batch_size": 0}, "at least 1"),
         ({"mode": "cached", "num_workers": 2}, "mode stream"),
         ({"num_workers": -1}, "must not be negative"),
-        ({"mode": "stream", "path": "nowhere.npz"}, "needs a dataset of shards; nowhere.npz is no such folder"),
+        ({"path": "nowhere.npz"}, "no dataset at nowhere.npz"),
         ({"path": "nowhere"}, "no dataset at nowhere"),
     ],
 )
@@ -230,7 +231,7 @@ def test_an_epoch_in_memory_is_finished_exactly_on_any_number_of_processes(
                 train=True,
                 bucket_by_blocks=bucketed,
                 epoch=lambda: 5,
-                place=partial(_place, rank, world),
+                rank=partial(_place, rank, world),
             )
             for rank in range(world)
         ]
@@ -267,9 +268,9 @@ def test_an_epoch_that_was_finished_is_not_begun_again(splits: dict[str, StackAr
 
 
 def test_what_fits_is_cached_and_what_does_not_is_streamed(dataset: Path) -> None:
-    frame = Frame.of(Manifest.load(dataset))
-    assert frame.bytes_per_sample == 10 * 25 + 512 + 8 * 6
-    needed = {"train": (71 + 23) * frame.bytes_per_sample / 1e9, "validation": 23 * frame.bytes_per_sample / 1e9}
+    each = bytes_per_sample(PAPER_WORLD)
+    assert each == 10 * 25 + 512 + 8 * 6
+    needed = {"train": (71 + 23) * each / 1e9, "validation": 23 * each / 1e9}
 
     def choice(limit: float, mode: str = "auto") -> list[bool]:
         data = StackDataModule(dataset, mode=mode, cache_gb=limit, test_path=dataset)  # type: ignore[arg-type]
@@ -294,7 +295,7 @@ def test_a_stream_knows_the_scale_of_the_poses(dataset: Path, splits: dict[str, 
 def test_memory_counted_is_memory_taken(splits: dict[str, StackArrays]) -> None:
     arrays = splits["train"]
     parts = (arrays.shapes, arrays.poses, arrays.silhouettes, arrays.template, arrays.counts, arrays.lengths)
-    assert sum(part.nbytes for part in parts) == len(arrays) * Frame(10, 4, 64).bytes_per_sample
+    assert sum(part.nbytes for part in parts) == len(arrays) * bytes_per_sample(PAPER_WORLD)
 
 
 DISTRIBUTED = """

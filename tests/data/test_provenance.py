@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from stackgen.data.dataset import Dataset
 from stackgen.data.provenance import physics_differences, warn_of_other_physics
-from stackgen.data.shards import Manifest
 from tests.conftest import Cli
 
 
@@ -33,7 +33,7 @@ TINY = """
 trainer: {max_steps: 1, logger: false, enable_checkpointing: false, enable_progress_bar: false,
           enable_model_summary: false, limit_val_batches: 0}
 model:
-  class_path: stackgen.models.diffusion.module.DDPM
+  class_path: stackgen.models.DDPM
   init_args: {denoiser: {width: 32, layers: 1, heads: 2, feedforward: 64}}
 """
 
@@ -44,7 +44,7 @@ def test_fit_says_so_once_if_the_data_are_of_other_physics(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     shutil.copytree(towers_dataset, "data")
-    manifest = Manifest.load("data")
+    manifest = Dataset.open("data").manifest
     replace(manifest, physics={**manifest.physics, "solver_iterations": 20}).save(Path("data"))
     Path("tiny.yaml").write_text(TINY)
     with pytest.warns(UserWarning, match="other physics") as caught:

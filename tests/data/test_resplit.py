@@ -10,10 +10,12 @@ from pathlib import Path
 import pytest
 
 from stackgen.data import resplit as module
-from stackgen.data.generation.templates import Template
+from stackgen.data.dataset import Dataset
+from stackgen.data.generation.designs import Design
 from stackgen.data.inspection.verify import verify
+from stackgen.data.manifest import SPLITS, Manifest
 from stackgen.data.resplit import By, Resplit, resplit, split_table
-from stackgen.data.shards import SPLITS, Manifest, Sample, write_shard
+from stackgen.data.shards import Sample, write_shard
 from stackgen.errors import StackgenError
 from tests.conftest import Cli
 
@@ -21,11 +23,11 @@ from tests.conftest import Cli
 @pytest.fixture
 def families(dataset: Path, samples: dict[str, list[Sample]], tmp_path: Path) -> Path:
     """40 templates with three stacks each, every other one the mirror image of the one before."""
-    manifest = Manifest.load(dataset)
+    manifest = Dataset.open(dataset).manifest
     designs = []
     for sample in samples["train-000000.tar"][:20]:
-        design = Template.from_key(sample.meta["layout"])
-        designs += [design.key, design.mirrored(manifest.catalogue, manifest.grid).key]
+        design = Design.from_key(sample.meta["layout"])
+        designs += [design.key, design.mirrored(manifest.world).key]
     made = [
         Sample(f"{t:08d}-{i:02d}", s.shapes, s.poses, s.silhouette, {"template": t, "layout": key, "removed": []})
         for t, key in enumerate(designs)
@@ -39,26 +41,26 @@ def families(dataset: Path, samples: dict[str, list[Sample]], tmp_path: Path) ->
 
 
 def sides(folder: Path, what: str) -> dict[str, set[object]]:
-    manifest = Manifest.load(folder)
-    return {split: {s.meta[what] for s in manifest.samples(folder, split)} for split in SPLITS}
+    dataset = Dataset.open(folder)
+    return {split: {s.meta[what] for s in dataset.samples(split)} for split in dataset.splits}
 
 
 def keys(folder: Path) -> Counter[str]:
-    manifest = Manifest.load(folder)
-    return Counter(sample.key for split in SPLITS for sample in manifest.samples(folder, split))
+    dataset = Dataset.open(folder)
+    return Counter(sample.key for split in dataset.splits for sample in dataset.samples(split))
 
 
 @pytest.mark.parametrize("by", ["template", "layout"])
 def test_the_same_stacks_in_other_shares_and_families_stay_together(families: Path, tmp_path: Path, by: By) -> None:
     out = tmp_path / "other"
     manifest = resplit(families, out, Resplit(0.1, 0.3, by))
-    assert manifest == Manifest.load(out) and keys(out) == keys(families)
+    assert manifest == Dataset.open(out).manifest and keys(out) == keys(families)
     assert verify(out) == []
     templates = sides(out, "template")
     assert all(templates[a].isdisjoint(templates[b]) for a, b in combinations(SPLITS, 2))
     assert [len(templates[split]) for split in SPLITS] == pytest.approx([24, 4, 12], abs=2)
     assert manifest.settings["resplit"] == {
-        "validation": 0.1, "test": 0.3, "by": by, "seed": 0, "source": Manifest.load(families).sha256
+        "validation": 0.1, "test": 0.3, "by": by, "seed": 0, "source": Dataset.open(families).manifest.sha256
     }  # fmt: skip
     twins = split_table(out, manifest)["train"]["designs in another split too"]
     assert twins == 0 if by == "layout" else twins > 0
@@ -94,7 +96,7 @@ def test_what_does_not_say_its_layout_cannot_be_split_by_it(towers_dataset: Path
     with pytest.raises(StackgenError, match="can only be split by template"):
         resplit(towers_dataset, tmp_path / "x", Resplit(0.1, 0.1, "layout"))
     assert not list(tmp_path.iterdir())
-    table = split_table(towers_dataset, Manifest.load(towers_dataset))
+    table = split_table(towers_dataset, Dataset.open(towers_dataset).manifest)
     assert [row["templates"] for row in table.values()] == [48, 12, 12]
     assert {row["designs"] for row in table.values()} == {0}
 

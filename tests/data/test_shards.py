@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 import webdataset
 
-from stackgen.data.shards import FORMAT, SPLITS, Manifest, Sample, decode_sample, read_shard, write_shard
+from stackgen.data.dataset import Dataset
+from stackgen.data.manifest import FORMAT, SPLITS, Manifest
+from stackgen.data.shards import Sample, decode, read_shard, write_shard
 from stackgen.errors import StackgenError
 from stackgen.world import PAPER_CATALOGUE
 
@@ -42,10 +44,10 @@ def test_a_shard_is_read_back_as_written(dataset: Path, samples: dict[str, list[
 
 
 def test_a_manifest_s_samples_are_those_of_the_split(dataset: Path, samples: dict[str, list[Sample]]) -> None:
-    manifest = Manifest.load(dataset)
+    manifest = Dataset.open(dataset).manifest
     for split in SPLITS:
         wanted = [sample for name, those in samples.items() if name.startswith(split) for sample in those]
-        found = list(manifest.samples(dataset, split))
+        found = list(Dataset.open(dataset).samples(split))
         assert [sample.key for sample in found] == [sample.key for sample in wanted]
         assert manifest.count(split) == len(wanted)
 
@@ -125,27 +127,27 @@ def test_pickles_are_not_read(three: tuple[Path, dict[str, Any]]) -> None:
     np.save(buffer, np.array([print], dtype=object), allow_pickle=True)
     members = {"shapes.npy": buffer.getvalue(), "poses.npy": b"", "silhouette.npy": b"", "meta.json": b"{}"}
     with pytest.raises(ValueError, match="allow_pickle"):
-        decode_sample(sample.key, members)
+        decode({"__key__": sample.key, **members})
 
 
 # The manifest.
 
 
 def test_a_manifest_survives_its_file(dataset: Path, tmp_path: Path) -> None:
-    manifest = Manifest.load(dataset)
+    manifest = Dataset.open(dataset).manifest
     manifest.save(tmp_path)
-    assert Manifest.load(tmp_path) == manifest
+    assert Dataset.open(tmp_path).manifest == manifest
     assert (tmp_path / "dataset.json").read_bytes() == (dataset / "dataset.json").read_bytes()
     assert manifest.to_json()["format"] == FORMAT
     assert manifest.to_json()["counts"] == {"train": 71, "validation": 23, "test": 7}
 
 
 def test_the_manifest_s_hash_names_every_shard_s(dataset: Path) -> None:
-    manifest = Manifest.load(dataset)
+    manifest = Dataset.open(dataset).manifest
     changed = json.loads(json.dumps(manifest.to_json()))
     changed["shards"][1]["sha256"] = "0" * 64
     other = Manifest(**{**vars(manifest), "shards": tuple(changed["shards"])})
-    assert other.sha256 != manifest.sha256 == Manifest.load(dataset).sha256
+    assert other.sha256 != manifest.sha256 == Dataset.open(dataset).manifest.sha256
 
 
 @pytest.mark.parametrize(
@@ -162,5 +164,5 @@ def test_a_folder_without_a_proper_manifest_is_refused(tmp_path: Path, text: str
     if text is not None:
         (tmp_path / "dataset.json").write_text(text)
     with pytest.raises(StackgenError, match=message) as caught:
-        Manifest.load(tmp_path)
+        Dataset.open(tmp_path)
     assert "\n" not in str(caught.value)

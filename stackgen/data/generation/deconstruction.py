@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from stackgen.sim.checkers import AcceptLimits, accept
 from stackgen.sim.simulator import Simulator
-from stackgen.sim.statics.plane import Certificate, Outcome, PlaneStatics
+from stackgen.sim.statics.plane import StaticsMargins, Outcome, PlaneStatics
 from stackgen.stack import Stack
 
-NEVER = Certificate(enabled=False)
+NEVER = StaticsMargins(enabled=False)
 """Statics is never asked."""
 
 
@@ -60,7 +60,7 @@ class Judge:
     simulator: Simulator
     limits: AcceptLimits
     settle_twice: bool
-    certificate: Certificate = NEVER
+    certificate: StaticsMargins = NEVER
 
     def settle(self, stack: Stack) -> Settled | None:
         """A design at rest, or None. Whatever is known of it, it is put down first: designs are not at rest."""

@@ -19,21 +19,22 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from stackgen.data.card import write_card
+from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.data.generation.deconstruction import Judge, deconstruct
+from stackgen.data.generation.designs import Design, DesignSettings, draw_design, realize
 from stackgen.data.generation.executors import Executor, make_executor
 from stackgen.data.generation.pictures import Pictures
-from stackgen.data.generation.templates import Template, TemplateSettings, draw_template, realize
-from stackgen.data.generation.workshop import Entry, Shard, Workshop, claim, disk_may_be_full, finished, sweep
-from stackgen.data.shards import PARTS, Manifest, Sample, Split, encode_shard, read_shard, shard_entry, split_of
+from stackgen.data.generation.workshop import PARTS, MadeShard, Workshop, claim, disk_may_be_full, finished, sweep
+from stackgen.data.manifest import Manifest, ShardEntry, Split, shard_entry, split_of
+from stackgen.data.shards import Sample, encode_shard, read_shard
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
 from stackgen.sim.checkers import AcceptLimits
 from stackgen.sim.physics import Physics
 from stackgen.sim.simulator import Simulator
-from stackgen.sim.statics.plane import Certificate
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid
+from stackgen.sim.statics.plane import StaticsMargins
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, World
 
-TESTSET = Path(__file__).resolve().parents[2] / "assets" / "testset-v1"
 REVISION = 1
 """Of the generator: raised when equal settings begin to mean other stacks, so that nobody mixes the two."""
 _HOPELESS = 2000  # templates without a stack, after which none is expected
@@ -74,9 +75,9 @@ class GenerateSettings:
     max_blocks: int = MAX_BLOCKS
     settle_twice: bool = True
     exclude_testset: bool = True
-    template: TemplateSettings = field(default_factory=TemplateSettings)
+    template: DesignSettings = field(default_factory=DesignSettings)
     accept: AcceptLimits = field(default_factory=AcceptLimits)
-    certificate: Certificate = field(default_factory=Certificate)
+    certificate: StaticsMargins = field(default_factory=StaticsMargins)
     physics: Physics = field(default_factory=Physics)
     grid: Grid = PAPER_GRID
     catalogue: Catalogue = PAPER_CATALOGUE
@@ -91,7 +92,7 @@ class GenerateSettings:
         if not 0 <= self.draw <= self.stacks:
             raise StackgenError(f"generate: draw must lie in 0..stacks, got {self.draw}")
         self.grid.require_room()
-        self.template.check(self.catalogue, self.grid)
+        self.template.check(self.world)
         thinnest = min(self.catalogue, key=lambda shape: shape.size[2])
         if self.physics.fall_height >= thinnest.size[2]:
             raise StackgenError(
@@ -115,13 +116,18 @@ class GenerateSettings:
         """
         plain = {**_BEFORE, **{key: value for key, value in manifest.settings.items() if key != "revision"}}
         physics = {key: value for key, value in manifest.physics.items() if key != "engine"}
-        world = {key: getattr(manifest, key) for key in ("name", "seed", "grid", "catalogue", "max_blocks")}
+        world = {"name": manifest.name, "seed": manifest.seed, **vars(manifest.world)}
         try:
             return _revived(GenerateSettings, {**plain, **world, "physics": physics})
         except (KeyError, TypeError) as error:
             raise StackgenError(
                 f"dataset {manifest.name!r} was not made by this version of `stackgen generate`: {error}"
             ) from error
+
+    @property
+    def world(self) -> World:
+        """The world of its stacks."""
+        return World(self.catalogue, self.grid, self.max_blocks)
 
     def split_of(self, shard: int) -> Split:
         """The split of a shard."""
@@ -206,29 +212,28 @@ def generate_range(
     return sum(entry["samples"] for entry in known.values())
 
 
-def testset_layouts(catalogue: Catalogue, grid: Grid) -> set[str]:
-    """Layouts of the templates that `testset-v1` was made from, and their mirror images, in the numbers of
-    another catalogue: shapes are the same if name and outline are."""
-    return set(_layouts_of(TESTSET, catalogue, grid))
+def testset_designs(world: World) -> frozenset[str]:
+    """List the designs that `testset-v1` was made from, and their mirror images, in the numbers of another
+    catalogue: shapes are the same if name and outline are."""
+    return _designs_of(TESTSET, world)
 
 
 @cache
-def _layouts_of(testset: Path, catalogue: Catalogue, grid: Grid) -> frozenset[str]:
-    if not (testset / "dataset.json").exists():
+def _designs_of(path: Path, world: World) -> frozenset[str]:
+    if not (path / "dataset.json").exists():
         return frozenset()
-    manifest = Manifest.load(testset)
-    if (grid.width, grid.height) != (manifest.grid.width, manifest.grid.height):
+    testset = Dataset.open(path)
+    if (world.grid.width, world.grid.height) != (testset.world.grid.width, testset.world.grid.height):
         return frozenset()
-    numbers = {
-        i: catalogue.shapes.index(shape) for i, shape in enumerate(manifest.catalogue) if shape in catalogue.shapes
-    }
-    layouts: set[str] = set()
-    for key in {sample.meta["layout"] for sample in manifest.samples(testset, "test")}:
-        rows = Template.from_key(key).rows
+    shapes = world.catalogue.shapes
+    numbers = {i: shapes.index(shape) for i, shape in enumerate(testset.world.catalogue) if shape in shapes}
+    designs: set[str] = set()
+    for key in {sample.meta["layout"] for sample in testset.samples("test")}:
+        rows = Design.from_key(key).rows
         if all(shape in numbers for row in rows for shape, _ in row):
-            template = Template(tuple(tuple((numbers[shape], left) for shape, left in row) for row in rows))
-            layouts |= {template.key, template.mirrored(catalogue, grid).key}
-    return frozenset(layouts)
+            design = Design(tuple(tuple((numbers[shape], left) for shape, left in row) for row in rows))
+            designs |= {design.key, design.mirrored(world).key}
+    return frozenset(designs)
 
 
 def _revived(kind: type[Any], plain: Mapping[str, Any]) -> Any:
@@ -250,10 +255,10 @@ def template_samples(
 ) -> list[Sample]:
     """All stacks that one template gives, or none."""
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
-    template = draw_template(rng, settings.template, settings.catalogue, settings.grid)
-    if template.key in excluded:
+    design = draw_design(rng, settings.world, settings.template)
+    if design.key in excluded:
         return []
-    start = realize(template, rng, settings.template, settings.catalogue, settings.grid)
+    start = realize(design, rng, settings.world, settings.template)
     judge = Judge(simulator, settings.accept, settings.settle_twice, settings.certificate)
     pictures = Pictures(settings.grid)
     samples = []
@@ -263,7 +268,7 @@ def template_samples(
         poses = stack.poses.astype(np.float32)
         picture = pictures.front(stack.with_poses(poses))
         key = f"{number:08d}-{'.'.join(f'{b:02d}' for b in removed) or 'whole'}".replace(".", "_")
-        meta = {"template": number, "layout": template.key, "removed": list(removed)}
+        meta = {"template": number, "layout": design.key, "removed": list(removed)}
         samples.append(Sample(key, stack.shapes.astype(np.uint8), poses, picture, meta))
     return samples
 
@@ -274,7 +279,7 @@ class ShardTask:
 
     Args:
         settings: Of the dataset.
-        excluded: Layouts to leave out.
+        excluded: Designs to leave out.
     """
 
     settings: GenerateSettings
@@ -283,20 +288,19 @@ class ShardTask:
     @staticmethod
     def of(settings: GenerateSettings) -> ShardTask:
         """The task of a dataset."""
-        layouts = testset_layouts(settings.catalogue, settings.grid) if settings.exclude_testset else set()
-        return ShardTask(settings, frozenset(layouts))
+        return ShardTask(settings, testset_designs(settings.world) if settings.exclude_testset else frozenset())
 
-    def __call__(self, shard: int) -> Shard:
+    def __call__(self, shard: int) -> MadeShard:
         """Make one shard."""
         settings = self.settings
         first = shard * settings.templates_per_shard
-        with Simulator(settings.physics, settings.catalogue) as simulator:
+        with Simulator(settings.physics) as simulator:
             samples = [
                 sample
                 for number in range(first, first + settings.templates_per_shard)
                 for sample in template_samples(settings, number, self.excluded, simulator)
             ]
-        return Shard(f"{settings.split_of(shard)}-{shard:06d}.tar", encode_shard(samples), len(samples))
+        return MadeShard(f"{settings.split_of(shard)}-{shard:06d}.tar", encode_shard(samples), len(samples))
 
 
 def make_shards(
@@ -305,11 +309,11 @@ def make_shards(
     executor: Executor,
     progress: Callable[[int], None] | None = None,
     say: Callable[[str], None] | None = None,
-) -> list[Entry]:
+) -> list[ShardEntry]:
     """Write as many shards as it takes, the last one cut to size; returns the entries of those not empty."""
     progress, say = progress or _ignore, say or _ignore
     known = workshop.whole(say)
-    entries: list[Entry] = []
+    entries: list[ShardEntry] = []
     stored = 0
     made = executor.map(ShardTask.of(settings), (number for number in count() if number not in known))
     with contextlib.closing(made):
@@ -349,28 +353,26 @@ def _are(settings: GenerateSettings, plain: Any) -> bool:
         return False
 
 
-def _manifest(settings: GenerateSettings, entries: tuple[Entry, ...]) -> Manifest:
+def _manifest(settings: GenerateSettings, entries: tuple[ShardEntry, ...]) -> Manifest:
     return Manifest(
         settings.name,
         settings.seed,
-        settings.catalogue,
-        settings.grid,
-        settings.max_blocks,
+        settings.world,
         settings.physics.to_json(),
         settings.to_json(),
         entries,
     )
 
 
-def draw(folder: Path, entries: list[Entry], settings: GenerateSettings) -> Shard:
+def draw(folder: Path, entries: list[ShardEntry], settings: GenerateSettings) -> MadeShard:
     """Keep `settings.draw` stacks of all in a folder's shards, drawn uniformly, in one shard."""
     samples = [sample for entry in entries for sample in read_shard(folder / entry["file"], entry["sha256"])]
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(2**32,)))
     chosen = np.sort(rng.choice(len(samples), settings.draw, replace=False))
-    return Shard(entries[0]["file"], encode_shard(samples[i] for i in chosen), len(chosen))
+    return MadeShard(entries[0]["file"], encode_shard(samples[i] for i in chosen), len(chosen))
 
 
-def _store(folder: Path, shard: Shard) -> Entry:
+def _store(folder: Path, shard: MadeShard) -> ShardEntry:
     write_atomically(folder / shard.name, shard.content)
     return shard_entry(shard.name, shard.content, shard.samples)
 

@@ -27,7 +27,7 @@ class Pictures:
             place = (shape, pose.tobytes())
             if place not in self._drawn:
                 self._drawn[place] = silhouette(
-                    Stack(np.array([shape]), pose[None], stack.catalogue), "front", self.grid
+                    Stack(np.array([shape]), pose[None], stack.catalogue), self.grid, "front"
                 )
             picture |= self._drawn[place]
         return picture

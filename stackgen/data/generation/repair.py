@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from stackgen.data.card import write_card
+from stackgen.data.dataset import Dataset
 from stackgen.data.generation.executors import Executor, make_executor
 from stackgen.data.generation.generate import REVISION, GenerateSettings, ShardTask, draw, make_shards
-from stackgen.data.generation.workshop import Entry, Shard, Workshop, disk_may_be_full
-from stackgen.data.shards import PARTS, Manifest, encode_shard, is_whole, iterate_shard, shard_entry, shard_number
+from stackgen.data.generation.workshop import PARTS, MadeShard, Workshop, disk_may_be_full
+from stackgen.data.manifest import Manifest, ShardEntry, shard_entry, shard_number
+from stackgen.data.shards import encode_shard, is_whole, iterate_shard
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
 from stackgen.sim.physics import engine_version
@@ -51,7 +53,7 @@ def repair(
         StackgenError: If there is no dataset, its settings are not known, or what is made is not what was
             written; nothing but identical shards has then been put back.
     """
-    manifest = Manifest.load(folder)
+    manifest = Dataset.open(folder).manifest
     lost = {
         shard_number(entry["file"]): entry
         for entry in manifest.shards
@@ -60,8 +62,8 @@ def repair(
     if not lost:
         return Repaired()
     settings = _settings(manifest, other_bytes)
-    identical: list[Shard] = []
-    other: list[Shard] = []
+    identical: list[MadeShard] = []
+    other: list[MadeShard] = []
     with disk_may_be_full(folder):
         made = _made(folder, manifest, settings, list(lost), executor or make_executor("local"))
         for done, (number, shard) in enumerate(made, 1):
@@ -113,7 +115,7 @@ def _difference(manifest: Manifest) -> str:
 
 def _made(
     folder: Path, manifest: Manifest, settings: GenerateSettings, numbers: list[int], executor: Executor
-) -> Iterator[tuple[int, Shard]]:
+) -> Iterator[tuple[int, MadeShard]]:
     """The shards of some numbers, made again."""
     if not settings.draw:
         with contextlib.closing(executor.map(ShardTask.of(settings), numbers)) as made:
@@ -126,15 +128,15 @@ def _made(
     shutil.rmtree(parts, ignore_errors=True)
 
 
-def _cut(shard: Shard, samples: int) -> Shard:
+def _cut(shard: MadeShard, samples: int) -> MadeShard:
     """The last shard of a dataset was cut to its first samples."""
     if shard.samples <= samples:
         return shard
     kept = list(iterate_shard(shard.content))[:samples]
-    return Shard(shard.name, encode_shard(kept), samples)
+    return MadeShard(shard.name, encode_shard(kept), samples)
 
 
-def _record(folder: Path, manifest: Manifest, others: list[Shard]) -> None:
+def _record(folder: Path, manifest: Manifest, others: list[MadeShard]) -> None:
     """Put what the new shards are into manifest and card."""
     new: dict[str, dict[str, Any]] = {
         shard.name: {
@@ -143,7 +145,7 @@ def _record(folder: Path, manifest: Manifest, others: list[Shard]) -> None:
         }
         for shard in others
     }
-    entries: tuple[Entry, ...] = tuple(new.get(entry["file"], entry) for entry in manifest.shards)
+    entries: tuple[ShardEntry, ...] = tuple(new.get(entry["file"], entry) for entry in manifest.shards)
     changed = replace(manifest, shards=entries)
     changed.save(folder)
     write_card(folder, changed)

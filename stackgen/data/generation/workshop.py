@@ -16,15 +16,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from stackgen.data.shards import PARTS, PROGRESS, Manifest, encode_shard, is_whole, read_shard, shard_entry
+from stackgen.data.dataset import Dataset
+from stackgen.data.manifest import Manifest, ShardEntry, shard_entry
+from stackgen.data.shards import encode_shard, is_whole, read_shard
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
 
-Entry = dict[str, Any]
+PROGRESS, PARTS = "progress", "parts"
+"""Folders within a dataset that is not complete yet: the record of whole shards, and what is drawn from."""
 
 
 @dataclass(frozen=True)
-class Shard:
+class MadeShard:
     """A shard that is not on disk yet."""
 
     name: str
@@ -47,7 +50,7 @@ class Workshop:
         """Where the record is kept."""
         return self.folder / PROGRESS
 
-    def whole(self, say: Callable[[str], None], only: range | None = None) -> dict[int, Entry]:
+    def whole(self, say: Callable[[str], None], only: range | None = None) -> dict[int, ShardEntry]:
         """Entries of the shards that are as they were written, by number.
 
         Args:
@@ -68,7 +71,7 @@ class Workshop:
                 say(f"{record} is damaged: its shard is made again")
         return found
 
-    def keep(self, number: int, shard: Shard) -> Entry:
+    def keep(self, number: int, shard: MadeShard) -> ShardEntry:
         """Write a shard, then its record."""
         entry = shard_entry(shard.name, shard.content, shard.samples)
         write_atomically(self.folder / shard.name, shard.content)
@@ -76,7 +79,7 @@ class Workshop:
         write_atomically(self.progress / f"{number:06d}.json", json.dumps(entry).encode())
         return entry
 
-    def trim(self, entry: Entry, keep: int) -> Entry:
+    def trim(self, entry: ShardEntry, keep: int) -> ShardEntry:
         """Cut a shard to its first samples. Its record stays that of the whole, which a kill thus brings back."""
         if keep >= entry["samples"]:
             return entry
@@ -126,7 +129,7 @@ def finished(out: Path) -> Manifest | None:
     """
     if not (out / "dataset.json").exists():
         return None
-    manifest = Manifest.load(out)
+    manifest = Dataset.open(out).manifest
     lost = [entry["file"] for entry in manifest.shards if not is_whole(out / entry["file"], entry["sha256"])]
     if lost:
         more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""

@@ -15,16 +15,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from stackgen.data.generation.templates import cells_wide
+from stackgen.data.arrays import PADDING, StackArrays
+from stackgen.data.dataset import Dataset
+from stackgen.data.generation.designs import cells_wide
 from stackgen.data.inspection.seen_layouts import as_scalars, layout_codes, seen_layouts
 from stackgen.data.inspection.verify import sample_keys
-from stackgen.data.loading.arrays import StackArrays, load_dataset
-from stackgen.data.loading.decoding import PADDING
-from stackgen.data.shards import SPLITS, Manifest
+from stackgen.data.manifest import SPLITS, Manifest
 from stackgen.geometry import tilt
 from stackgen.protocols import StabilityChecker
 from stackgen.stack import Stack
-from stackgen.world import Catalogue, Grid
+from stackgen.world import World
 
 SAME = 0.01
 """Stacks of the same shapes whose poses differ by no more than this [cell, rad] are duplicates."""
@@ -55,16 +55,15 @@ class Contents:
         Raises:
             StackgenError: If it cannot be read, or a shard is damaged.
         """
-        splits, facts = load_dataset(path)
-        names = [split for split in SPLITS if split in splits]
-        arrays = StackArrays.concatenate([splits[name] for name in names])
-        number = np.repeat([SPLITS.index(name) for name in names], [len(splits[name]) for name in names])
-        manifest = Manifest.from_json(facts, path)
+        dataset = Dataset.open(path)
+        parts = [dataset.split(name) for name in dataset.splits]
+        arrays = StackArrays.concatenate(parts)
+        number = np.repeat([SPLITS.index(name) for name in dataset.splits], [len(part) for part in parts])
         depth = np.full(len(arrays), -1)
-        if path.is_dir():
-            found = _depths(manifest, path)
+        if not dataset.is_compact:
+            found = _depths(dataset)
             depth = found if len(found) == len(arrays) else depth
-        return Contents(arrays, number, depth, manifest)
+        return Contents(arrays, number, depth, dataset.manifest)
 
     def of(self, split: str) -> StackArrays:
         """The stacks of one split."""
@@ -76,19 +75,19 @@ class Contents:
         return Stack(
             self.arrays.shapes[index, :k].astype(np.int64),
             self.arrays.poses[index, :k].astype(np.float64),
-            self.manifest.catalogue,
+            self.manifest.world.catalogue,
         )
 
 
 _KEY = re.compile(rb"\d+-(whole|\d\d(?:_\d\d)*)")
 
 
-def _depths(manifest: Manifest, folder: Path) -> NDArray[np.int64]:
+def _depths(dataset: Dataset) -> NDArray[np.int64]:
     """Blocks removed from each stack's template, by its key, split by split."""
     depths: list[int] = []
-    for split in SPLITS:
-        for path in manifest.paths(folder, split):
-            for key in sample_keys(path.read_bytes()):
+    for split in dataset.splits:
+        for shard in dataset.shards(split):
+            for key in sample_keys(shard.read()):
                 match = _KEY.fullmatch(key)
                 depths.append(-1 if match is None else 0 if match[1] == b"whole" else match[1].count(b"_") + 1)
     return np.array(depths, np.int64)
@@ -127,16 +126,16 @@ def facts(
 
 def counts(contents: Contents) -> dict[str, dict[str, int]]:
     """How many stacks, or blocks, there are of each kind."""
-    arrays, manifest = contents.arrays, contents.manifest
+    arrays, catalogue = contents.arrays, contents.manifest.world.catalogue
     real = arrays.shapes != PADDING
-    heights = np.array([shape.size[2] for shape in manifest.catalogue])[np.where(real, arrays.shapes, 0)]
+    heights = np.array([shape.size[2] for shape in catalogue])[np.where(real, arrays.shapes, 0)]
     tops = np.where(real, arrays.poses[..., 2] + heights / 2, 0).max(axis=1)
     by: dict[str, dict[str, int]] = {
         "split": {split: int((contents.split == i).sum()) for i, split in enumerate(SPLITS)},
         "templates by split": {
             split: len(np.unique(arrays.template[contents.split == i])) for i, split in enumerate(SPLITS)
         },
-        "blocks by shape": {name: int(arrays.counts[:, i].sum()) for i, name in enumerate(manifest.catalogue.names)},
+        "blocks by shape": {name: int(arrays.counts[:, i].sum()) for i, name in enumerate(catalogue.names)},
         "stacks by blocks": _tally(arrays.lengths),
         "stacks by height [cell]": _tally(np.round(2 * tops) / 2),
         "distinct": {
@@ -153,10 +152,10 @@ def counts(contents: Contents) -> dict[str, dict[str, int]]:
 
 def distributions(contents: Contents) -> dict[str, Floats]:
     """Of all blocks: how far each is from its place in the design, its yaw and its tilt."""
-    arrays, manifest = contents.arrays, contents.manifest
+    arrays = contents.arrays
     real = arrays.shapes != PADDING
     poses = arrays.poses[real].astype(np.float64)
-    beside = beside_design(arrays.shapes[real], poses[:, 0], manifest.catalogue, manifest.grid)
+    beside = beside_design(arrays.shapes[real], poses[:, 0], contents.manifest.world)
     return {
         "x beside the design [cell]": beside,
         "y beside the design [cell]": poses[:, 1],
@@ -165,15 +164,15 @@ def distributions(contents: Contents) -> dict[str, Floats]:
     }
 
 
-def beside_design(shapes: ArrayLike, x: Floats, catalogue: Catalogue, grid: Grid) -> Floats:
+def beside_design(shapes: ArrayLike, x: Floats, world: World) -> Floats:
     """(n,) distance [cell] of blocks from the nearest place at which they fill whole cells.
 
-    >>> from stackgen.geometry import PAPER_GRID
-    >>> from stackgen.stack import PAPER_CATALOGUE
-    >>> beside_design([0, 1], np.array([0.45, -0.9]), PAPER_CATALOGUE, PAPER_GRID).round(6).tolist()
+    >>> from stackgen.world import PAPER_WORLD
+    >>> beside_design([0, 1], np.array([0.45, -0.9]), PAPER_WORLD).round(6).tolist()
     [-0.05, 0.1]
     """
-    left = x - np.array([cells_wide(shape) for shape in catalogue])[np.asarray(shapes)] / 2 + grid.width / 2
+    cells = np.array([cells_wide(shape) for shape in world.catalogue])
+    left = x - cells[np.asarray(shapes)] / 2 + world.grid.width / 2
     return left - np.round(left)
 
 
@@ -211,7 +210,7 @@ def duplicates(contents: Contents, same: float = SAME) -> dict[str, int]:
         `stacks`, how many have a twin; `surplus`, how many could go; `across splits`, how many have a twin in
         another split.
     """
-    twins = twin_pairs(contents.arrays, contents.manifest, same)
+    twins = twin_pairs(contents.arrays, contents.manifest.world, same)
     if not len(twins):
         return {"stacks": 0, "surplus": 0, "across splits": 0}
     across = twins[contents.split[twins[:, 0]] != contents.split[twins[:, 1]]]
@@ -221,9 +220,9 @@ def duplicates(contents: Contents, same: float = SAME) -> dict[str, int]:
     return {"stacks": len(np.unique(twins)), "surplus": surplus, "across splits": len(np.unique(across))}
 
 
-def twin_pairs(arrays: StackArrays, manifest: Manifest, same: float = SAME) -> NDArray[np.int64]:
+def twin_pairs(arrays: StackArrays, world: World, same: float = SAME) -> NDArray[np.int64]:
     """(P, 2) pairs of stacks, the earlier first, of the same shapes with all poses within `same` [cell, rad]."""
-    codes = as_scalars(layout_codes(arrays, grid=manifest.grid, catalogue=manifest.catalogue), arrays.shapes.shape[1])
+    codes = as_scalars(layout_codes(arrays, world), arrays.shapes.shape[1])
     order = np.argsort(codes, kind="stable")
     starts = np.flatnonzero(np.concatenate([[True], codes[order][1:] != codes[order][:-1]]))
     pairs = [np.empty((0, 2), np.int64)]
@@ -247,12 +246,11 @@ def nearness(contents: Contents, testset: Path) -> dict[str, Any] | None:
 
     A mirror image counts as held, since training may mirror.
     """
-    scenes, facts_ = load_dataset(testset, ("test",))
-    theirs, ours = Manifest.from_json(facts_, testset), contents.manifest
-    train, test = contents.of("train"), scenes["test"]
-    if theirs.catalogue != ours.catalogue or theirs.grid != ours.grid or not len(train):
+    scenes, ours = Dataset.open(testset), contents.manifest.world
+    train, test = contents.of("train"), scenes.split("test")
+    if (scenes.world.catalogue, scenes.world.grid) != (ours.catalogue, ours.grid) or not len(train):
         return None
-    seen = partial(seen_layouts, train, test, grid=ours.grid, catalogue=ours.catalogue)
+    seen = partial(seen_layouts, train, test, ours)
     best = nearest_silhouettes(train.silhouettes, test.silhouettes, test.image_size)
     return {
         "scenes": len(test),
@@ -264,11 +262,11 @@ def nearness(contents: Contents, testset: Path) -> dict[str, Any] | None:
     }
 
 
-def _held(train: StackArrays, test: StackArrays, manifest: Manifest) -> int:
+def _held(train: StackArrays, test: StackArrays, world: World) -> int:
     """Test stacks of which training has a twin."""
     columns = max(train.shapes.shape[1], test.shapes.shape[1])
     both = StackArrays.concatenate([_widened(train, columns), _widened(test, columns)])
-    twins = twin_pairs(both, manifest)
+    twins = twin_pairs(both, world)
     across = twins[(twins[:, 0] < len(train)) & (twins[:, 1] >= len(train))]
     return len(np.unique(across[:, 1]))
 
@@ -312,8 +310,7 @@ def nearest_silhouettes(train: NDArray[np.uint8], test: NDArray[np.uint8], image
 
 
 def _layouts(contents: Contents, positions: bool) -> NDArray[np.void]:
-    manifest = contents.manifest
-    codes = layout_codes(contents.arrays, positions=positions, grid=manifest.grid, catalogue=manifest.catalogue)
+    codes = layout_codes(contents.arrays, contents.manifest.world, positions=positions)
     return as_scalars(codes, codes.shape[1])
 
 

@@ -94,7 +94,7 @@ def draw_samples(contents: Contents, number: int = 24, seed: int = 0) -> Picture
     chosen = np.sort(np.random.default_rng(seed).choice(len(contents.arrays), size, replace=False))
     manifest = contents.manifest
     title = f"{size} of {len(contents.arrays):,} stacks of {manifest.name}, drawn at random"
-    return contact_sheet(None, [contents.stack(i) for i in chosen], title=title, grid=manifest.grid)
+    return contact_sheet(None, [contents.stack(i) for i in chosen], title=title, grid=manifest.world.grid)
 
 
 def paragraphs(found: Mapping[str, Any], pictures: Sequence[str] = ()) -> list[str]:

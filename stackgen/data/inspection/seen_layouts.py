@@ -1,8 +1,9 @@
 """Which stacks of one set have a layout that another set holds too: what a network may have learnt by heart.
 
 Two notions of "the same", from coarse to fine. The *layout* is that of
-:func:`stackgen.sampling.feasible.layout`, by which the paper counts diversity: the shapes of each layer from left to right. The *design* adds the cell in which each
-block begins, as in the `layout` of a sample's metadata; what it leaves out is displacement and settling alone.
+:func:`stackgen.sampling.feasible.layout`, by which the paper counts diversity: the shapes of each
+layer from left to right. The *design* adds the cell in which each block begins, and leaves out displacement
+and settling alone; the `layout` of a sample's metadata is one.
 
 Pure numpy, no simulator and no torch. Legend: M stacks, N blocks at most.
 """
@@ -14,15 +15,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.data.generation.templates import cells_wide
-from stackgen.data.loading.decoding import PADDING
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid
+from stackgen.data.arrays import PADDING
+from stackgen.data.generation.designs import cells_wide
+from stackgen.world import World
 
 _EMPTY = -1
 
 
 class PaddedStacks(Protocol):
-    """What is read of :class:`stackgen.data.loading.arrays.StackArrays`."""
+    """What is read of :class:`stackgen.data.arrays.StackArrays`."""
 
     @property
     def shapes(self) -> NDArray[np.uint8]:
@@ -38,11 +39,10 @@ class PaddedStacks(Protocol):
 def seen_layouts(
     train: PaddedStacks,
     test: PaddedStacks,
+    world: World,
     *,
     positions: bool = False,
     mirror: bool = True,
-    grid: Grid = PAPER_GRID,
-    catalogue: Catalogue = PAPER_CATALOGUE,
 ) -> NDArray[np.bool_]:
     """(M,) for each stack of `test` whether `train` holds a stack of the same layout.
 
@@ -51,20 +51,22 @@ def seen_layouts(
     Args:
         train: What was trained on.
         test: What is asked about.
+        world: The world of both.
         positions: Compare designs instead: also the cell in which each block begins.
         mirror: What is the mirror image of a training stack counts as seen, as in training with `data.mirror`.
-        grid, catalogue: The world of both.
 
     >>> from types import SimpleNamespace
+    >>> from stackgen.world import PAPER_WORLD
     >>> def pair(left: int, right: int) -> SimpleNamespace:
     ...     poses = np.array([[[-1, 0, 0.5, 0, 0, 0], [1, 0, 0.5, 0, 0, 0]]], np.float32)
     ...     return SimpleNamespace(shapes=np.array([[left, right]], np.uint8), poses=poses)
-    >>> seen_layouts(pair(0, 1), pair(1, 0)).tolist(), seen_layouts(pair(0, 1), pair(1, 0), mirror=False).tolist()
-    ([True], [False])
+    >>> held, asked = pair(0, 1), pair(1, 0)
+    >>> [seen_layouts(held, asked, PAPER_WORLD, mirror=mirror).tolist() for mirror in (True, False)]
+    [[True], [False]]
     """
 
     def codes(stacks: PaddedStacks, mirrored: bool = False) -> NDArray[np.int32]:
-        return layout_codes(stacks, positions=positions, mirrored=mirrored, grid=grid, catalogue=catalogue)
+        return layout_codes(stacks, world, positions=positions, mirrored=mirrored)
 
     known = np.concatenate([codes(train), codes(train, mirrored=True)]) if mirror else codes(train)
     columns = max(train.shapes.shape[1], test.shapes.shape[1])
@@ -72,28 +74,23 @@ def seen_layouts(
 
 
 def layout_codes(
-    stacks: PaddedStacks,
-    *,
-    positions: bool = False,
-    mirrored: bool = False,
-    grid: Grid = PAPER_GRID,
-    catalogue: Catalogue = PAPER_CATALOGUE,
+    stacks: PaddedStacks, world: World, *, positions: bool = False, mirrored: bool = False
 ) -> NDArray[np.int32]:
     """(M, N) layouts as numbers: equal rows, equal layouts.
 
     Args:
         stacks: M of them.
+        world: Their world.
         positions: Add the cell in which each block begins.
         mirrored: Of the mirror images.
-        grid, catalogue: Their world.
     """
-    real = stacks.shapes != PADDING
+    grid, real = world.grid, stacks.shapes != PADDING
     shapes = np.where(real, stacks.shapes, 0).astype(np.int32)
     x = -stacks.poses[..., 0] if mirrored else stacks.poses[..., 0]
     layers = np.clip(np.floor(stacks.poses[..., 2]), 0, grid.height - 1).astype(np.int32)
     codes = layers * 256 + shapes
     if positions:
-        cells = np.array([cells_wide(shape) for shape in catalogue])
+        cells = np.array([cells_wide(shape) for shape in world.catalogue])
         left = np.round(x - cells[shapes] / 2 + grid.width / 2)
         codes = codes * 256 + np.clip(left, -128, 127).astype(np.int32) + 128
     order = np.lexsort((x, np.where(real, layers, grid.height)), axis=-1)

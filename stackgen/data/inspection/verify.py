@@ -7,13 +7,15 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.data.loading.decoding import Frame, decode_shard
-from stackgen.data.shards import PARTS, PROGRESS, SPLITS, Manifest
+from stackgen.data.dataset import Dataset
+from stackgen.data.decoding import decode_shard
+from stackgen.data.generation.workshop import PARTS, PROGRESS
+from stackgen.data.manifest import Manifest, ShardEntry
 
 Fault = Literal["missing", "truncated", "altered", "unreadable", "wrong", "foreign"]
 _BLOCK = 512  # of a tar; a member's name is the beginning of one [byte]
@@ -55,7 +57,7 @@ def verify(folder: Path, progress: Callable[[int], None] | None = None) -> list[
     Raises:
         StackgenError: If there is no dataset.
     """
-    manifest = Manifest.load(folder)
+    manifest = Dataset.open(folder).manifest
     problems = _of_manifest(folder, manifest)
     seen = _Seen({}, {})
     for number, entry in enumerate(manifest.shards, 1):
@@ -76,14 +78,14 @@ class _Seen:
 def _of_manifest(folder: Path, manifest: Manifest) -> list[Problem]:
     problems = []
     counts = json.loads((folder / "dataset.json").read_bytes()).get("counts")
-    if counts != {split: manifest.count(split) for split in SPLITS}:
+    if counts != manifest.counts:
         problems.append(Problem("dataset.json", "wrong", "its counts are not the sums of its shards'"))
     files = [entry["file"] for entry in manifest.shards]
     twice = {file for file in files if files.count(file) > 1}
     return problems + [Problem(file, "wrong", "dataset.json names it twice") for file in sorted(twice)]
 
 
-def _of_shard(folder: Path, manifest: Manifest, entry: dict[str, Any], seen: _Seen) -> list[Problem]:
+def _of_shard(folder: Path, manifest: Manifest, entry: ShardEntry, seen: _Seen) -> list[Problem]:
     name = entry["file"]
     if Path(name).name != name:
         return [Problem("dataset.json", "wrong", f"it names a file {name!r} outside of the folder")]
@@ -93,7 +95,7 @@ def _of_shard(folder: Path, manifest: Manifest, entry: dict[str, Any], seen: _Se
         return [Problem(name, "missing", f"{entry['samples']} stacks")]
     except OSError as error:
         return [Problem(name, "unreadable", error.strerror or str(error))]
-    decoded = decode_shard(content, Frame.of(manifest))
+    decoded = decode_shard(content, manifest.world)
     readable = len(decoded.positions)
     if hashlib.sha256(content).hexdigest() != entry["sha256"]:
         truncated = len(content) % _RECORD != 0 or any(content[-_END:])
@@ -102,7 +104,7 @@ def _of_shard(folder: Path, manifest: Manifest, entry: dict[str, Any], seen: _Se
     problems = [Problem(name, "unreadable", f"sample {text}") for text in decoded.broken]
     if readable + len(decoded.broken) != entry["samples"]:
         problems.append(Problem(name, "wrong", f"{readable} stacks, but dataset.json says {entry['samples']}"))
-    return problems + _repeated(name, entry["split"], content, decoded.template, seen)
+    return problems + _repeated(name, entry["split"], content, decoded.stacks.template, seen)
 
 
 def _repeated(name: str, split: str, content: bytes, templates: NDArray[np.int64], seen: _Seen) -> list[Problem]:

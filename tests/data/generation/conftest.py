@@ -7,22 +7,22 @@ from pathlib import Path
 import pytest
 
 from stackgen.data.generation.generate import ShardTask, generate
-from stackgen.data.generation.workshop import Shard
+from stackgen.data.generation.workshop import MadeShard
 from tests.data.generation.making import SMALL, Here, Stored
 
 
 @pytest.fixture(scope="session")
-def shards() -> dict[int, Shard]:
+def shards() -> dict[int, MadeShard]:
     """More shards of the small dataset than it needs."""
     task = ShardTask.of(SMALL)
-    made: dict[int, Shard] = {}
+    made: dict[int, MadeShard] = {}
     while sum(shard.samples for shard in made.values()) < SMALL.stacks:
         made[len(made)] = task(len(made))
     return {**made, **{number: task(number) for number in range(len(made), len(made) + 3)}}
 
 
 @pytest.fixture(scope="session")
-def small(shards: dict[int, Shard], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def small(shards: dict[int, MadeShard], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The small dataset, made undisturbed in one process; not to be written to."""
     folder = tmp_path_factory.mktemp("generate") / "small"
     generate(SMALL, folder, executor=Stored(shards))

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from stackgen.data.generation.generate import GenerateSettings
-from stackgen.data.generation.workshop import Shard
+from stackgen.data.generation.workshop import MadeShard
 
 T = TypeVar("T")
 
@@ -30,7 +30,7 @@ class Here:
 class Stored:
     """Hands over shards that were made before, several at a time and the last one first; no others."""
 
-    shards: dict[int, Shard]
+    shards: dict[int, MadeShard]
     together: int = 1
 
     def map(self, task: Callable[[int], T], numbers: Iterable[int]) -> Generator[tuple[int, T], None, None]:

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from stackgen.data.generation.deconstruction import Judge, deconstruct, surely_falls
-from stackgen.data.generation.templates import Template, draw_template, realize
+from stackgen.data.generation.designs import Design, draw_design, realize
 from stackgen.geometry import block_vertices, tilt
 from stackgen.sim.checkers import AcceptLimits, accept, fell
 from stackgen.sim.simulator import Rollout, Simulator
-from stackgen.sim.statics.plane import Certificate
+from stackgen.sim.statics.plane import StaticsMargins
 from stackgen.stack import Stack
+from stackgen.world import PAPER_WORLD
 
 Family = list[tuple[tuple[int, ...], Stack]]
 
@@ -34,7 +35,7 @@ def families(simulator: Simulator) -> list[tuple[Stack, Family]]:
     found: list[tuple[Stack, Family]] = []
     rng = np.random.default_rng(3)
     while len(found) < 4:
-        template = realize(draw_template(rng), rng)
+        template = realize(draw_design(rng, PAPER_WORLD), rng, PAPER_WORLD)
         if len(template) > 9:
             continue
         family = list(deconstruct(template, judge))
@@ -56,7 +57,7 @@ def upright(*blocks: tuple[int, float, float]) -> Stack:
 def of(key: str) -> Stack:
     """A design as text, put down on its cells."""
     rng = np.random.default_rng(0)
-    stack = realize(Template.from_key(key), rng)
+    stack = realize(Design.from_key(key), rng, PAPER_WORLD)
     poses = stack.poses.copy()
     poses[:, 0] = np.round(poses[:, 0] * 2) / 2
     return stack.with_poses(poses)
@@ -168,7 +169,7 @@ class Counting:
 
 
 def certified(simulator: Simulator | Counting, **margins: float) -> Judge:
-    return Judge(simulator, LIMITS, settle_twice=True, certificate=replace(Certificate(), **margins))  # type: ignore[arg-type]
+    return Judge(simulator, LIMITS, settle_twice=True, certificate=replace(StaticsMargins(), **margins))  # type: ignore[arg-type]
 
 
 def test_with_the_certificate_the_family_of_a_sure_design_is_the_same_but_for_what_has_no_margin(

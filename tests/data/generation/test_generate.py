@@ -13,27 +13,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.data.generation import generate as module
-from stackgen.data.generation.generate import GenerateSettings, generate, template_samples, testset_layouts
-from stackgen.data.generation.templates import Template, TemplateSettings
-from stackgen.data.generation.workshop import Shard
-from stackgen.data.shards import SPLITS, Manifest, Sample, read_shard
+from stackgen.data.generation.designs import Design, DesignSettings
+from stackgen.data.generation.generate import GenerateSettings, generate, template_samples, testset_designs
+from stackgen.data.generation.workshop import MadeShard
+from stackgen.data.manifest import SPLITS, Manifest
+from stackgen.data.shards import Sample, read_shard
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette
 from stackgen.sim.checkers import AcceptLimits
 from stackgen.sim.physics import Physics
 from stackgen.sim.simulator import Simulator
-from stackgen.sim.statics.plane import Certificate
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Shape
+from stackgen.sim.statics.plane import StaticsMargins
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Catalogue, Grid, Shape
 from tests.conftest import Cli
 from tests.data.generation.making import SMALL, Here, Stored, contents, copy, flip
 
-testset_layouts.__test__ = False  # type: ignore[attr-defined]  # a function of the generator, not a test
+testset_designs.__test__ = False  # type: ignore[attr-defined]  # a function of the generator, not a test
 
 
 def samples_of(folder: Path) -> list[Sample]:
-    manifest = Manifest.load(folder)
-    return [sample for split in SPLITS for sample in manifest.samples(folder, split)]
+    dataset = Dataset.open(folder)
+    return [sample for split in dataset.splits for sample in dataset.samples(split)]
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +47,7 @@ def simulator() -> Iterator[Simulator]:
 # The same bytes.
 
 
-def test_what_is_lost_is_made_again(small: Path, shards: dict[int, Shard], tmp_path: Path) -> None:
+def test_what_is_lost_is_made_again(small: Path, shards: dict[int, MadeShard], tmp_path: Path) -> None:
     out = copy(small, tmp_path / "copy")
     first, *_, last = sorted(out.glob("*.tar"), key=lambda path: path.name[-10:])
     first.unlink()
@@ -57,12 +59,10 @@ def test_what_is_lost_is_made_again(small: Path, shards: dict[int, Shard], tmp_p
 
 
 def test_the_settings_of_a_manifest_are_those_it_was_made_with(small: Path) -> None:
-    assert GenerateSettings.from_manifest(Manifest.load(small)) == SMALL
-    template = TemplateSettings(top_row_only=("triangle", "cube"))
+    assert GenerateSettings.from_manifest(Dataset.open(small).manifest) == SMALL
+    template = DesignSettings(top_row_only=("triangle", "cube"))
     other = replace(SMALL, physics=Physics(friction=0.4), template=template, accept=AcceptLimits(tilt=0.2))
-    manifest = Manifest(
-        other.name, other.seed, other.catalogue, other.grid, other.max_blocks, other.physics.to_json(), other.to_json()
-    )
+    manifest = Manifest(other.name, other.seed, other.world, other.physics.to_json(), other.to_json())
     assert GenerateSettings.from_manifest(manifest) == other
     strange = replace(manifest, settings={**manifest.settings, "sturdy": True})
     with pytest.raises(StackgenError, match=r"not made by this version .*sturdy"):
@@ -70,7 +70,7 @@ def test_the_settings_of_a_manifest_are_those_it_was_made_with(small: Path) -> N
 
 
 def test_a_draw_is_part_of_the_whole_and_drawing_again_changes_nothing(
-    small: Path, shards: dict[int, Shard], tmp_path: Path
+    small: Path, shards: dict[int, MadeShard], tmp_path: Path
 ) -> None:
     out = tmp_path / "drawn"
     settings = replace(SMALL, stacks=30, draw=15)
@@ -99,7 +99,7 @@ def test_another_seed_makes_another_dataset(small: Path, simulator: Simulator) -
 
 
 def test_there_are_exactly_as_many_stacks_as_asked_for(small: Path) -> None:
-    manifest = Manifest.load(small)
+    manifest = Dataset.open(small).manifest
     assert sum(manifest.count(split) for split in SPLITS) == 45 == len(samples_of(small))
     assert sorted(p.name for p in small.glob("*.tar")) == sorted(shard["file"] for shard in manifest.shards)
     for shard in manifest.shards:
@@ -110,10 +110,10 @@ def test_there_are_exactly_as_many_stacks_as_asked_for(small: Path) -> None:
 
 
 def test_no_template_is_in_two_splits(small: Path) -> None:
-    manifest = Manifest.load(small)
-    templates = {split: {s.meta["template"] for s in manifest.samples(small, split)} for split in SPLITS}
-    assert sum(map(bool, templates.values())) >= 2
-    assert all(templates[a].isdisjoint(templates[b]) for a, b in combinations(SPLITS, 2))
+    dataset = Dataset.open(small)
+    templates = [{s.meta["template"] for s in dataset.samples(split)} for split in dataset.splits]
+    assert len(templates) >= 2
+    assert all(a.isdisjoint(b) for a, b in combinations(templates, 2))
 
 
 def test_the_splits_have_their_shares_from_early_on() -> None:
@@ -133,8 +133,8 @@ def test_samples_are_what_the_format_says(small: Path) -> None:
     for sample in found:
         assert sample.shapes.dtype == np.uint8 and 1 <= len(sample.shapes) <= 10
         assert sample.poses.dtype == np.float32 and sample.poses.shape == (len(sample.shapes), 6)
-        assert (sample.silhouette == silhouette(sample.stack(PAPER_CATALOGUE))).all()
-        design = Template.from_key(sample.meta["layout"])
+        assert (sample.silhouette == silhouette(sample.stack(PAPER_CATALOGUE), PAPER_GRID)).all()
+        design = Design.from_key(sample.meta["layout"])
         kinds = [shape for row in design.rows for shape, _ in row]
         assert sample.shapes.tolist() == np.delete(kinds, sample.meta["removed"]).tolist()
         assert len(sample.meta["removed"]) <= 4
@@ -165,11 +165,11 @@ def test_long_lists_are_not_stored_but_still_deconstructed(simulator: Simulator)
 
 
 def test_layouts_of_the_test_set_and_their_mirror_images_are_left_out(small: Path, simulator: Simulator) -> None:
-    layouts = testset_layouts(PAPER_CATALOGUE, PAPER_GRID)
-    frozen = list(Manifest.load(module.TESTSET).samples(module.TESTSET, "test"))
+    layouts = testset_designs(PAPER_WORLD)
+    frozen = list(Dataset.open(TESTSET).samples("test"))
     for sample in frozen[::25]:
-        design = Template.from_key(sample.meta["layout"])
-        assert {design.key, design.mirrored(PAPER_CATALOGUE, PAPER_GRID).key} <= layouts
+        design = Design.from_key(sample.meta["layout"])
+        assert {design.key, design.mirrored(PAPER_WORLD).key} <= layouts
     assert {s.meta["layout"] for s in samples_of(small)}.isdisjoint(layouts)
     sample = samples_of(small)[0]
     number, key = sample.meta["template"], sample.meta["layout"]
@@ -182,10 +182,8 @@ def test_a_generator_that_meets_a_test_layout_leaves_it_out(
 ) -> None:
     """With its own first templates as the test set, a dataset begins after them."""
     frozen = tmp_path / "testset"
-    first = generate(
-        replace(SMALL, stacks=8, draw=8, validation=0, test=1, exclude_testset=False), frozen, executor=Here()
-    )
-    forbidden = {sample.meta["layout"] for sample in first.samples(frozen, "test")}
+    generate(replace(SMALL, stacks=8, draw=8, validation=0, test=1, exclude_testset=False), frozen, executor=Here())
+    forbidden = {sample.meta["layout"] for sample in Dataset.open(frozen).samples("test")}
     assert forbidden & {sample.meta["layout"] for sample in samples_of(small)}
     monkeypatch.setattr(module, "TESTSET", frozen)
     generate(replace(SMALL, stacks=12), tmp_path / "rest", executor=Here())
@@ -194,15 +192,15 @@ def test_a_generator_that_meets_a_test_layout_leaves_it_out(
 
 
 def test_the_test_set_is_left_out_of_catalogues_that_number_shapes_otherwise() -> None:
-    layouts = testset_layouts(PAPER_CATALOGUE, PAPER_GRID)
+    layouts = testset_designs(PAPER_WORLD)
     turned = Catalogue(PAPER_CATALOGUE.shapes[::-1])
-    rows = {tuple(tuple((3 - s, left) for s, left in row) for row in Template.from_key(k).rows) for k in layouts}
-    assert testset_layouts(turned, PAPER_GRID) == {Template(design).key for design in rows}
-    assert testset_layouts(PAPER_CATALOGUE, Grid(width=5)) == set()
-    shorter = testset_layouts(Catalogue(PAPER_CATALOGUE.shapes[:2]), PAPER_GRID)
+    rows = {tuple(tuple((3 - s, left) for s, left in row) for row in Design.from_key(k).rows) for k in layouts}
+    assert testset_designs(replace(PAPER_WORLD, catalogue=turned)) == {Design(design).key for design in rows}
+    assert testset_designs(replace(PAPER_WORLD, grid=Grid(width=5))) == set()
+    shorter = testset_designs(replace(PAPER_WORLD, catalogue=Catalogue(PAPER_CATALOGUE.shapes[:2])))
     assert shorter == {key for key in layouts if "2@" not in key and "3@" not in key}
     longer = Catalogue((*PAPER_CATALOGUE.shapes[:2], Shape.box("long_rectangle", 4), PAPER_CATALOGUE[3]))
-    assert testset_layouts(longer, PAPER_GRID) == {key for key in layouts if "2@" not in key}
+    assert testset_designs(replace(PAPER_WORLD, catalogue=longer)) == {key for key in layouts if "2@" not in key}
 
 
 # Refusals.
@@ -215,7 +213,7 @@ def test_a_folder_of_other_settings_is_refused_and_left_alone(small: Path) -> No
         replace(SMALL, stacks=46),
         replace(SMALL, physics=Physics(friction=0.4)),
         replace(SMALL, accept=AcceptLimits(tilt=0.2)),
-        replace(SMALL, template=TemplateSettings(displacement=0.2)),
+        replace(SMALL, template=DesignSettings(displacement=0.2)),
     ):
         with pytest.raises(StackgenError, match="other settings") as caught:
             generate(other, small, executor=Stored({}))
@@ -224,9 +222,9 @@ def test_a_folder_of_other_settings_is_refused_and_left_alone(small: Path) -> No
 
 
 def test_a_folder_of_the_same_settings_from_before_they_were_all_written_down_is_accepted(
-    shards: dict[int, Shard], tmp_path: Path
+    shards: dict[int, MadeShard], tmp_path: Path
 ) -> None:
-    plain = replace(SMALL, certificate=Certificate(enabled=False), settle_twice=False)
+    plain = replace(SMALL, certificate=StaticsMargins(enabled=False), settle_twice=False)
     generate(plain, tmp_path, executor=Stored(shards))
     claim = tmp_path / "generate.json"
     before = json.loads(claim.read_text())
@@ -250,7 +248,7 @@ def test_a_folder_of_unknown_shards_is_refused(small: Path, tmp_path: Path) -> N
 
 def test_damage_since_the_dataset_was_complete_is_named_with_the_way_out(small: Path, tmp_path: Path) -> None:
     out = copy(small, tmp_path / "copy")
-    victim, other = (out / entry["file"] for entry in Manifest.load(out).shards[:2])
+    victim, other = (out / entry["file"] for entry in Dataset.open(out).manifest.shards[:2])
     flip(victim, 600)
     before = contents(out)
     line = rf"{victim.name}: missing or damaged .* `stackgen dataset repair {out}`"
@@ -288,7 +286,7 @@ SMALL_OPTIONS = [
 
 
 def test_jobs_make_ranges_and_a_run_without_one_collects_them(
-    small: Path, shards: dict[int, Shard], tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
+    small: Path, shards: dict[int, MadeShard], tmp_path: Path, cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("stackgen.commands.generate.make_executor", lambda *_: Stored(shards))
     out = ["--out", tmp_path / "small"]

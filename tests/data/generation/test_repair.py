@@ -8,12 +8,14 @@ from pathlib import Path
 
 import pytest
 
+from stackgen.data.dataset import Dataset
 from stackgen.data.generation import repair as module
 from stackgen.data.generation.generate import generate
 from stackgen.data.generation.repair import repair
-from stackgen.data.generation.workshop import Shard
+from stackgen.data.generation.workshop import MadeShard
 from stackgen.data.inspection.verify import Problem, verify
-from stackgen.data.shards import Manifest, encode_shard, iterate_shard, shard_number, write_shard
+from stackgen.data.manifest import shard_number
+from stackgen.data.shards import encode_shard, iterate_shard, write_shard
 from stackgen.errors import StackgenError
 from tests.conftest import Cli
 from tests.data.generation.making import SMALL, Here, Stored, contents, copy, flip
@@ -26,7 +28,7 @@ def out(small: Path, tmp_path: Path) -> Path:
 
 
 def tars(folder: Path) -> list[Path]:
-    return [folder / entry["file"] for entry in Manifest.load(folder).shards]
+    return [folder / entry["file"] for entry in Dataset.open(folder).manifest.shards]
 
 
 def change_manifest(folder: Path, **changes: object) -> None:
@@ -73,7 +75,7 @@ def test_what_is_missing_truncated_or_foreign_is_named(out: Path) -> None:
 
 
 def test_a_broken_sample_is_named_even_if_the_checksum_is_right(out: Path) -> None:
-    manifest = Manifest.load(out)
+    manifest = Dataset.open(out).manifest
     victim = tars(out)[0]
     samples = list(iterate_shard(victim.read_bytes()))
     samples[1].poses[0, 0] = float("nan")
@@ -85,7 +87,7 @@ def test_a_broken_sample_is_named_even_if_the_checksum_is_right(out: Path) -> No
 
 
 def test_a_manifest_that_contradicts_itself_is_named(out: Path) -> None:
-    manifest = Manifest.load(out)
+    manifest = Dataset.open(out).manifest
     first, second, *others = manifest.shards
     change_manifest(out, counts={"train": 1, "validation": 2, "test": 3})
     assert verify(out) == [Problem("dataset.json", "wrong", "its counts are not the sums of its shards'")]
@@ -96,7 +98,7 @@ def test_a_manifest_that_contradicts_itself_is_named(out: Path) -> None:
 
 
 def test_stacks_that_are_there_twice_and_templates_on_two_sides_are_named(out: Path) -> None:
-    manifest = Manifest.load(out)
+    manifest = Dataset.open(out).manifest
     source = tars(out)[0]
     other = "test" if source.name.startswith("train") else "train"
     entry = write_shard(out / f"{other}-000099.tar", list(iterate_shard(source.read_bytes()))[:1])
@@ -109,7 +111,7 @@ def test_stacks_that_are_there_twice_and_templates_on_two_sides_are_named(out: P
 
 
 def test_lost_shards_are_made_again_byte_for_byte_and_no_others(
-    small: Path, out: Path, shards: dict[int, Shard]
+    small: Path, out: Path, shards: dict[int, MadeShard]
 ) -> None:
     first, second, *_, last = tars(out)
     flip(first, 600)
@@ -129,7 +131,7 @@ def test_a_repair_simulates_again_what_was_simulated(small: Path, out: Path, her
     assert contents(out) == contents(small)
 
 
-def test_a_drawn_dataset_is_repaired_too(shards: dict[int, Shard], tmp_path: Path) -> None:
+def test_a_drawn_dataset_is_repaired_too(shards: dict[int, MadeShard], tmp_path: Path) -> None:
     settings = replace(SMALL, stacks=30, draw=15)
     generate(settings, tmp_path, executor=Stored(shards))
     before = contents(tmp_path)
@@ -138,27 +140,29 @@ def test_a_drawn_dataset_is_repaired_too(shards: dict[int, Shard], tmp_path: Pat
     assert contents(tmp_path) == before
 
 
-def other_shards(shards: dict[int, Shard]) -> Stored:
+def other_shards(shards: dict[int, MadeShard]) -> Stored:
     """As another version would make them: the first stack is missing."""
     return Stored(
         {
-            number: Shard(shard.name, encode_shard(list(iterate_shard(shard.content))[1:]), shard.samples - 1)
+            number: MadeShard(shard.name, encode_shard(list(iterate_shard(shard.content))[1:]), shard.samples - 1)
             for number, shard in shards.items()
         }
     )
 
 
-def test_what_cannot_be_made_again_is_left_alone_unless_that_is_asked_for(out: Path, shards: dict[int, Shard]) -> None:
+def test_what_cannot_be_made_again_is_left_alone_unless_that_is_asked_for(
+    out: Path, shards: dict[int, MadeShard]
+) -> None:
     victim, *_ = tars(out)
     flip(victim, 600)
-    before, sha256 = contents(out), Manifest.load(out).sha256
+    before, sha256 = contents(out), Dataset.open(out).manifest.sha256
     line = f"{victim.name} cannot be made again byte for byte .*--other_bytes"
     with pytest.raises(StackgenError, match=line) as caught:
         repair(out, other_shards(shards))
     assert "\n" not in str(caught.value) and contents(out) == before
     done = repair(out, other_shards(shards), other_bytes=True)
     assert done.other == (victim.name,) and not done.identical
-    manifest = Manifest.load(out)
+    manifest = Dataset.open(out).manifest
     assert verify(out) == [] and manifest.sha256 != sha256
     assert manifest.shards[0]["samples"] == shards[shard_number(victim.name)].samples - 1
     assert "made_with" in manifest.shards[0] and "made_with" not in manifest.shards[1]
@@ -186,7 +190,7 @@ def test_another_version_is_said_before_anything_is_done(out: Path, change: dict
 
 
 def test_verify_and_repair_from_the_command_line(
-    small: Path, out: Path, shards: dict[int, Shard], cli: Cli, monkeypatch: pytest.MonkeyPatch
+    small: Path, out: Path, shards: dict[int, MadeShard], cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module, "make_executor", lambda *_: Stored(shards))
     monkeypatch.setattr("stackgen.data.generation.executors.make_executor", lambda *_: Stored(shards))

@@ -17,10 +17,11 @@ from pathlib import Path
 
 import pytest
 
+from stackgen.data.dataset import Dataset
 from stackgen.data.generation import workshop as workshop_module
 from stackgen.data.generation.generate import generate, generate_range
-from stackgen.data.generation.workshop import Shard
-from stackgen.data.shards import SPLITS, Manifest
+from stackgen.data.generation.workshop import MadeShard
+from stackgen.data.manifest import SPLITS
 from stackgen.errors import StackgenError
 from stackgen.io import files
 from tests.conftest import CHILD
@@ -82,7 +83,7 @@ def kill_at(step: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fuse]:
 
 @pytest.mark.parametrize("draw", [0, 15])
 def test_a_kill_at_any_step_changes_nothing(
-    draw: int, shards: dict[int, Shard], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    draw: int, shards: dict[int, MadeShard], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each step that changes the disk is tried in turn; the run is then taken up with others at work."""
     settings = replace(SMALL, draw=draw, exclude_testset=False)  # which takes longest, and is not asked here
@@ -99,11 +100,11 @@ def test_a_kill_at_any_step_changes_nothing(
             shutil.rmtree(out)
         else:
             break
-    assert step > 2 * len(Manifest.load(tmp_path / "undisturbed").shards)
+    assert step > 2 * len(Dataset.open(tmp_path / "undisturbed").manifest.shards)
 
 
 def test_a_run_that_is_killed_again_and_again_gets_there(
-    small: Path, shards: dict[int, Shard], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: Path, shards: dict[int, MadeShard], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rng, kills, out = random.Random(0), 0, tmp_path / "small"
     while True:
@@ -117,7 +118,7 @@ def test_a_run_that_is_killed_again_and_again_gets_there(
 
 
 def test_a_shard_that_was_damaged_since_the_kill_is_made_again(
-    small: Path, shards: dict[int, Shard], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: Path, shards: dict[int, MadeShard], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out, said = tmp_path / "small", list[str]()
     with pytest.raises(Killed), kill_at(7, monkeypatch):
@@ -132,7 +133,7 @@ def test_a_shard_that_was_damaged_since_the_kill_is_made_again(
 
 
 def test_a_full_disk_is_one_line_and_nothing_is_lost(
-    small: Path, shards: dict[int, Shard], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    small: Path, shards: dict[int, MadeShard], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "small"
     left = iter(range(5))
@@ -155,7 +156,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(
 
 
 def test_ranges_of_shards_are_collected_by_a_run_without_one(
-    small: Path, shards: dict[int, Shard], tmp_path: Path
+    small: Path, shards: dict[int, MadeShard], tmp_path: Path
 ) -> None:
     out, done = tmp_path / "small", list[int]()
     held = generate_range(SMALL, out, range(3, 5), Stored(shards), done.append)
@@ -168,7 +169,9 @@ def test_ranges_of_shards_are_collected_by_a_run_without_one(
     assert generate_range(SMALL, out, range(0, 2), Stored({})) == 0 and contents(out) == contents(small)
 
 
-def test_ranges_of_too_many_shards_leave_nothing_behind(small: Path, shards: dict[int, Shard], tmp_path: Path) -> None:
+def test_ranges_of_too_many_shards_leave_nothing_behind(
+    small: Path, shards: dict[int, MadeShard], tmp_path: Path
+) -> None:
     generate_range(SMALL, tmp_path / "small", range(len(shards)), Stored(shards))
     generate(SMALL, tmp_path / "small", executor=Stored({}))
     assert contents(tmp_path / "small") == contents(small)

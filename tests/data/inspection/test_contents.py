@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from stackgen.data.arrays import StackArrays
 from stackgen.data.card import MARK, dataset_card, write_card
-from stackgen.data.generation.generate import TESTSET
+from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.data.inspection.contents import (
     Contents,
     counts,
@@ -24,8 +25,7 @@ from stackgen.data.inspection.contents import (
     nearness,
     sample_margins,
 )
-from stackgen.data.loading.arrays import StackArrays
-from stackgen.data.shards import Manifest, Sample
+from stackgen.data.shards import Sample
 from stackgen.geometry import iou
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
@@ -59,8 +59,7 @@ def test_counts_are_those_of_counting(contents: Contents, samples: Samples) -> N
 
 
 def test_removals_are_read_from_the_keys(generated: Contents) -> None:
-    manifest = Manifest.load(TESTSET)
-    removed = [len(sample.meta["removed"]) for sample in manifest.samples(TESTSET, "test")]
+    removed = [len(sample.meta["removed"]) for sample in Dataset.open(TESTSET).samples("test")]
     assert generated.depth.tolist() == removed
     assert counts(generated)["stacks by removals"]["2"] == removed.count(2)
 
@@ -184,7 +183,7 @@ def test_info_puts_its_figures_into_the_card(towers_dataset: Path, tmp_path: Pat
 
 
 def test_a_card_s_snippet_reads_the_dataset_with_webdataset_and_numpy(dataset: Path, samples: Samples) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", dataset_card(Manifest.load(dataset)), re.DOTALL)
+    (code,) = re.findall(r"```python\n(.*?)```", dataset_card(Dataset.open(dataset).manifest), re.DOTALL)
     names: dict[str, np.ndarray] = {}
     with chdir(dataset):
         exec(compile(code, "card", "exec"), names)
@@ -193,7 +192,7 @@ def test_a_card_s_snippet_reads_the_dataset_with_webdataset_and_numpy(dataset: P
 
 
 def test_a_card_says_how_the_dataset_was_made() -> None:
-    text = dataset_card(Manifest.load(TESTSET))
+    text = dataset_card(Dataset.open(TESTSET).manifest)
     for words in (
         "500 stacks",
         "seed 191",
@@ -205,7 +204,7 @@ def test_a_card_says_how_the_dataset_was_made() -> None:
 
 
 def test_a_readme_that_is_not_ours_is_left_alone(dataset: Path, tmp_path: Path) -> None:
-    manifest = Manifest.load(dataset)
+    manifest = Dataset.open(dataset).manifest
     assert write_card(tmp_path, manifest) and write_card(tmp_path, manifest, ["more"])
     assert (tmp_path / "README.md").read_text().startswith(MARK)
     (tmp_path / "README.md").write_text("# mine\n")

@@ -18,11 +18,12 @@ import numpy as np
 import pytest
 import torch
 
+from stackgen.data.arrays import StackArrays
 from stackgen.data.datamodule import StackDataModule
-from stackgen.data.loading import order, streaming
-from stackgen.data.loading.arrays import StackArrays, load_dataset
+from stackgen.data.dataset import Dataset
+from stackgen.data.loading import passes, streaming
 from stackgen.data.loading.streaming import ExactStream, TrainingStream
-from stackgen.data.shards import Manifest, Sample, write_shard
+from stackgen.data.shards import Sample, write_shard
 from stackgen.errors import StackgenError
 
 TRAIN, VALIDATION = 71, 23  # samples of `dataset`
@@ -35,7 +36,7 @@ def _place(rank: int, world: int = 3) -> tuple[int, int]:
 @pytest.fixture(autouse=True)
 def small_window(monkeypatch: pytest.MonkeyPatch) -> None:
     """A window to suit the data."""
-    monkeypatch.setattr(order, "WINDOW", 16)
+    monkeypatch.setattr(passes, "WINDOW", 16)
 
 
 @contextmanager
@@ -56,7 +57,7 @@ def templates(batches: Any) -> list[int]:
 def copy_of(dataset: Path, folder: Path, **shards: list[Sample]) -> Path:
     """The dataset with other samples in some shards, as if it had been written so; `train_000001` names a shard."""
     shutil.copytree(dataset, folder)
-    manifest = Manifest.load(folder)
+    manifest = Dataset.open(folder).manifest
     entries = {entry["file"]: entry for entry in manifest.shards}
     for name, samples in shards.items():
         file = name.replace("_", "-") + ".tar"
@@ -103,7 +104,9 @@ def test_an_exact_stream_is_the_split_in_memory(dataset: Path, splits: dict[str,
 
 @pytest.mark.parametrize("batch_size", [1, 4, 7, 50])
 def test_ranks_share_an_exact_stream(dataset: Path, splits: dict[str, StackArrays], batch_size: int) -> None:
-    streams = [ExactStream(dataset, "validation", batch_size, place=partial(_place, rank)) for rank in range(3)]
+    streams = [
+        ExactStream(Dataset.open(dataset), "validation", batch_size, rank=partial(_place, rank)) for rank in range(3)
+    ]
     cached = StackDataModule(dataset, batch_size=batch_size)
     shares = [[batch["template"].tolist() for batch in stream] for stream in streams]
     assert [len(share) for share in shares] == [len(stream) for stream in streams]
@@ -123,7 +126,7 @@ def test_an_epoch_visits_everyone_at_most_once_and_leaves_out_less_than_a_step(
     seen, flips = Counter[int](), []
     for rank in range(world):
         stream = TrainingStream(
-            dataset, batch_size, num_workers=workers, mirror=True, place=partial(_place, rank, world)
+            Dataset.open(dataset), batch_size, num_workers=workers, mirror=True, rank=partial(_place, rank, world)
         )
         batches = list(stream)
         assert len(batches) == len(stream) == TRAIN // (batch_size * world)
@@ -142,7 +145,9 @@ def test_an_epoch_visits_everyone_at_most_once_and_leaves_out_less_than_a_step(
 
 
 def test_the_number_of_workers_changes_the_order_alone(dataset: Path) -> None:
-    epochs = [[b["template"].tolist() for b in TrainingStream(dataset, 5, num_workers=n)] for n in (0, 1, 2)]
+    epochs = [
+        [b["template"].tolist() for b in TrainingStream(Dataset.open(dataset), 5, num_workers=n)] for n in (0, 1, 2)
+    ]
     assert epochs[0] == epochs[1] != epochs[2]
     assert sorted(epochs[0]) == sorted(epochs[2])
 
@@ -150,7 +155,13 @@ def test_the_number_of_workers_changes_the_order_alone(dataset: Path) -> None:
 def test_a_stream_depends_on_seed_epoch_and_rank(dataset: Path) -> None:
     def epoch(number: int, seed: int = 0, rank: int = 0) -> list[Any]:
         stream = TrainingStream(
-            dataset, 8, seed=seed, mirror=True, samples_per_epoch=96, epoch=lambda: number, place=lambda: (rank, 2)
+            Dataset.open(dataset),
+            8,
+            seed=seed,
+            mirror=True,
+            samples_per_epoch=96,
+            epoch=lambda: number,
+            rank=lambda: (rank, 2),
         )
         assert len(stream) == 6
         return [(b["template"].tolist(), b["poses"].numpy().tobytes()) for b in stream]
@@ -161,14 +172,14 @@ def test_a_stream_depends_on_seed_epoch_and_rank(dataset: Path) -> None:
 
 
 def test_epochs_of_another_length_are_cut_from_one_row_of_passes(dataset: Path) -> None:
-    whole = TrainingStream(dataset, 16, seed=5)
-    cut = TrainingStream(dataset, 16, seed=5, samples_per_epoch=50)
+    whole = TrainingStream(Dataset.open(dataset), 16, seed=5)
+    cut = TrainingStream(Dataset.open(dataset), 16, seed=5, samples_per_epoch=50)
     assert len(whole) == 4 and len(cut) == 3
     assert templates([b for _ in range(4) for b in cut]) == templates([b for _ in range(3) for b in whole])
 
 
 def test_buckets_hold_like_with_like_and_no_more_padding_than_they_must(dataset: Path) -> None:
-    batches = list(TrainingStream(dataset, 4, bucket_by_blocks=True))
+    batches = list(TrainingStream(Dataset.open(dataset), 4, bucket_by_blocks=True))
     assert len(batches) == TRAIN // 4
     for batch in batches:
         assert batch["mask"].any(0).all() and batch["poses"].shape[1] == batch["mask"].shape[1]
@@ -176,15 +187,15 @@ def test_buckets_hold_like_with_like_and_no_more_padding_than_they_must(dataset:
     windows = -(-len(batches) // 4)  # of 16 samples
     lengths = 7  # 4 to 10 blocks
     assert sum(mixed) <= windows * (lengths - 1)
-    everyone = list(TrainingStream(dataset, 4))
+    everyone = list(TrainingStream(Dataset.open(dataset), 4))
     assert sorted(templates(batches)) == sorted(templates(everyone))
     assert sum(b["mask"].numel() for b in batches) < 0.8 * sum(b["mask"].numel() for b in everyone)
 
 
 def test_reading_leaves_the_random_numbers_of_the_model_alone(dataset: Path) -> None:
     torch.manual_seed(0)
-    list(TrainingStream(dataset, 8, mirror=True))
-    list(ExactStream(dataset, "validation", 8))
+    list(TrainingStream(Dataset.open(dataset), 8, mirror=True))
+    list(ExactStream(Dataset.open(dataset), "validation", 8))
     after = torch.rand(3)
     torch.manual_seed(0)
     assert torch.equal(after, torch.rand(3))
@@ -198,7 +209,7 @@ def test_reading_leaves_the_random_numbers_of_the_model_alone(dataset: Path) -> 
 def test_a_resumed_epoch_goes_on_with_the_next_sample(dataset: Path, workers: int, length: int | None) -> None:
     def stream() -> TrainingStream:
         return TrainingStream(
-            dataset,
+            Dataset.open(dataset),
             4,
             num_workers=workers,
             bucket_by_blocks=True,
@@ -215,7 +226,7 @@ def test_a_resumed_epoch_goes_on_with_the_next_sample(dataset: Path, workers: in
         first, second = stream(), stream()
         begun = shown(islice(first, stop))
         second.load_state_dict(json.loads(json.dumps(first.state_dict())))
-        assert len(second) == len(whole) and not second.relaid
+        assert len(second) == len(whole) and not second.is_leftover
         assert begun + shown(second) == whole
 
 
@@ -226,12 +237,13 @@ def test_on_another_number_of_processes_no_finished_window_is_read_again(
     state, seen, again = None, Counter[int](), 0
     for turn, world in enumerate(worlds):
         streams = [
-            TrainingStream(dataset, 4, place=partial(_place, rank, world), epoch=lambda: 2) for rank in range(world)
+            TrainingStream(Dataset.open(dataset), 4, rank=partial(_place, rank, world), epoch=lambda: 2)
+            for rank in range(world)
         ]
         for stream in streams:
             if state is not None:
                 stream.load_state_dict(state)
-                assert stream.relaid
+                assert stream.is_leftover
         assert len({len(stream) for stream in streams}) == 1
         stop = 5 if turn < len(worlds) - 1 else None
         lengths = set()
@@ -263,7 +275,7 @@ def test_a_damaged_shard_is_named_and_counted_and_takes_no_batch_away(damaged: P
 
 
 def test_damage_is_reported_in_every_epoch_and_named_in_the_first(damaged: Path) -> None:
-    stream = TrainingStream(damaged, 8)
+    stream = TrainingStream(Dataset.open(damaged), 8)
     with said() as lines:
         for _ in range(3):
             list(stream)
@@ -300,16 +312,19 @@ def test_broken_samples_are_skipped_named_and_counted(faulty: Path, workers: int
 
 def test_memory_skips_and_names_the_same_samples(faulty: Path) -> None:
     with said() as lines:
-        found = load_dataset(faulty)[0]
-    assert found["train"].template.tolist() == [t for t in range(71) if t != 45]
-    assert found["validation"].template.tolist() == [t for t in range(71, 94) if t not in (71, 80)]
-    assert len(lines) == 4 and lines[-1] == f"data: samples skipped in {faulty}: 3"
+        found = Dataset.open(faulty)
+        train, validation = found.split("train"), found.split("validation")
+    assert train.template.tolist() == [t for t in range(71) if t != 45]
+    assert validation.template.tolist() == [t for t in range(71, 94) if t not in (71, 80)]
+    assert len(lines) == 5
+    assert lines[1] == f"data: samples skipped in the train split of {faulty}: 1"
+    assert lines[-1] == f"data: samples skipped in the validation split of {faulty}: 2"
 
 
 def test_memory_refuses_a_damaged_shard(damaged: Path) -> None:
     for split, file in (("train", r"train-000000\.tar"), ("validation", r"validation-000002\.tar")):
         with pytest.raises(StackgenError, match=rf"{file} is damaged.*`stackgen dataset repair`") as caught:
-            load_dataset(damaged, (split,))
+            Dataset.open(damaged).split(split)
         assert "\n" not in str(caught.value)
 
 
@@ -324,7 +339,10 @@ def test_losses_leave_processes_with_equally_many_validation_batches(
     folder = copy_of(dataset, tmp_path / "lossy", validation_000002=those)
     with said() as lines:
         shares = [
-            [b["template"].tolist() for b in ExactStream(folder, "validation", batch_size, place=partial(_place, rank))]
+            [
+                b["template"].tolist()
+                for b in ExactStream(Dataset.open(folder), "validation", batch_size, rank=partial(_place, rank))
+            ]
             for rank in range(3)
         ]
     assert len({len(share) for share in shares}) == 1
@@ -344,7 +362,7 @@ def test_a_dataset_without_a_readable_sample_is_an_error_and_not_an_endless_wait
     for path in folder.glob("train-*.tar"):
         path.write_bytes(b"nothing")
     with said() as lines, pytest.raises(StackgenError, match="no readable sample in any shard") as caught:
-        list(TrainingStream(folder, 8, num_workers=workers))
+        list(TrainingStream(Dataset.open(folder), 8, num_workers=workers))
     assert "\n" not in str(caught.value)
     assert sum("is damaged" in line for line in lines) == 2
 
@@ -357,30 +375,30 @@ def test_after_many_unreadable_shards_in_a_row_it_gives_up(
     (folder / "train-000001.tar").unlink()
     monkeypatch.setattr(streaming, "HOPELESS", 2)
     with said(), pytest.raises(StackgenError, match=r"2 shards in a row cannot be read; .*there is no file"):
-        list(TrainingStream(folder, 8))
+        list(TrainingStream(Dataset.open(folder), 8))
 
 
 def test_a_shard_that_holds_fewer_samples_than_the_manifest_says_is_reported(
     dataset: Path, samples: dict[str, list[Sample]], tmp_path: Path
 ) -> None:
     folder = copy_of(dataset, tmp_path / "short", validation_000002=samples["validation-000002.tar"][:20])
-    manifest = Manifest.load(folder)
+    manifest = Dataset.open(folder).manifest
     entries = [{**entry, "samples": 23} if entry["split"] == "validation" else entry for entry in manifest.shards]
     replace(manifest, shards=tuple(entries)).save(folder)
     with said() as lines:
-        assert len(templates(ExactStream(folder, "validation", 8))) == 20
+        assert len(templates(ExactStream(Dataset.open(folder), "validation", 8))) == 20
     assert lines[-1] == "data: samples skipped in the validation split: 3"
     with said() as lines:
-        assert len(load_dataset(folder, ("validation",))[0]["validation"]) == 20
+        assert len(Dataset.open(folder).split("validation")) == 20
     assert lines == [
         "data: validation-000002.tar lacks 3 of the samples that dataset.json says it has",
-        f"data: samples skipped in {folder}: 3",
+        f"data: samples skipped in the validation split of {folder}: 3",
     ]
 
 
 def test_a_shard_that_holds_more_samples_than_the_manifest_says_is_refused(dataset: Path, tmp_path: Path) -> None:
     folder = copy_of(dataset, tmp_path / "long")
-    manifest = Manifest.load(folder)
+    manifest = Dataset.open(folder).manifest
     replace(manifest, shards=tuple({**entry, "samples": 20} for entry in manifest.shards)).save(folder)
     with pytest.raises(StackgenError, match=r"validation-000002\.tar holds more samples than dataset\.json says"):
-        load_dataset(folder, ("validation",))
+        Dataset.open(folder).split("validation")

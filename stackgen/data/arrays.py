@@ -1,41 +1,31 @@
-"""A split of a dataset as a few arrays: what training reads, and the compact file that travels.
-
-Needs numpy and torch alone: no shard reader beyond our own, no simulator.
+"""Stacks as a few arrays, and the batches that are gathered from them: what training reads.
 
 Legend: M stacks, N blocks at most, S shapes, H x W pixels, B stacks in a batch.
 """
 
 from __future__ import annotations
 
-import io
-import json
 import math
-import os
-import zipfile
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+from collections import deque
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-from stackgen.data.loading.buffers import Buffers
-from stackgen.data.loading.decoding import PADDING, Decoded, Frame
-from stackgen.data.loading.losses import Losses, decode_sound
-from stackgen.data.shards import SPLITS, Sample
-from stackgen.data.sources import Shard, is_folder, is_remote, load_manifest, read_bytes, shards_of
+from stackgen.data.shards import Sample
 from stackgen.errors import StackgenError
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE
+from stackgen.world import PAPER_WORLD, World
 
-LONG = 500_000
-"""Samples from which on reading them shows its progress: some ten seconds."""
+PADDING = 255
+"""Shape index of the slots after a stack's last block."""
 
 FIELDS = ("shapes", "poses", "silhouettes", "template")
-"""Of the arrays, and of the compact file."""
+"""Names of the arrays, here and in the compact file."""
 
 Batch = dict[str, Tensor]
 
@@ -49,7 +39,7 @@ class StackArrays:
         poses: (M, N, 6) float32 [cell, rad], zero after the last block.
         silhouettes: (M, H * W / 8) uint8, front silhouettes packed row by row, H = W.
         template: (M,) int64, the template each stack was deconstructed from.
-        num_shapes: S, the size of the catalogue.
+        num_shapes: S, the number of shapes in the catalogue.
 
     Raises:
         StackgenError: If the arrays do not fit each other.
@@ -59,7 +49,7 @@ class StackArrays:
     poses: NDArray[np.float32]
     silhouettes: NDArray[np.uint8]
     template: NDArray[np.int64]
-    num_shapes: int = len(PAPER_CATALOGUE)
+    num_shapes: int
 
     def __post_init__(self) -> None:
         kinds = {"shapes": np.uint8, "poses": np.float32, "silhouettes": np.uint8, "template": np.int64}
@@ -126,12 +116,6 @@ class StackArrays:
         return self.tensors.batch(torch.as_tensor(np.asarray(indices, dtype=np.int64)))
 
     @staticmethod
-    def of(decoded: Decoded, frame: Frame) -> StackArrays:
-        """The samples of a shard."""
-        parts = (decoded.shapes, decoded.poses, decoded.silhouettes, decoded.template)
-        return StackArrays(*parts, frame.num_shapes)
-
-    @staticmethod
     def concatenate(parts: Sequence[StackArrays]) -> StackArrays:
         """Several as one, in the order given; at least one."""
         if len(parts) == 1:
@@ -140,28 +124,55 @@ class StackArrays:
         return StackArrays(**fields, num_shapes=parts[0].num_shapes)
 
     @staticmethod
-    def from_samples(
-        samples: Iterable[Sample], max_blocks: int = MAX_BLOCKS, num_shapes: int = len(PAPER_CATALOGUE)
-    ) -> StackArrays:
-        """From samples, in the order given.
+    def from_samples(samples: Iterable[Sample], world: World) -> StackArrays:
+        """Put samples of a world together, in the order given.
 
         Raises:
             StackgenError: If there is no sample, or one that has too many blocks.
         """
         shapes, poses, silhouettes, template = [], [], [], []
         for sample in samples:
-            free = max_blocks - len(sample.shapes)
+            free = world.max_blocks - len(sample.shapes)
             if free < 0:
-                raise StackgenError(f"dataset: sample {sample.key} has more than {max_blocks} blocks")
+                raise StackgenError(f"dataset: sample {sample.key} has more than {world.max_blocks} blocks")
             shapes.append(np.pad(sample.shapes.astype(np.uint8), (0, free), constant_values=PADDING))
             poses.append(np.pad(sample.poses.astype(np.float32), ((0, free), (0, 0))))
             silhouettes.append(np.packbits(sample.silhouette))
             template.append(int(sample.meta["template"]))
         if not shapes:
             raise StackgenError("dataset: the shards hold no sample")
-        return StackArrays(
-            np.stack(shapes), np.stack(poses), np.stack(silhouettes), np.array(template, np.int64), num_shapes
-        )
+        columns = np.stack(shapes), np.stack(poses), np.stack(silhouettes), np.array(template, np.int64)
+        return StackArrays(*columns, num_shapes=len(world.catalogue))
+
+
+class Buffers:
+    """Memory for float pictures on the CPU, used again once nobody holds what was made of it.
+
+    64 MB a batch of 4096: to ask the system for them anew costs more than to fill them.
+
+    Args:
+        most: Buffers kept; whoever holds more batches than this gets fresh memory.
+    """
+
+    def __init__(self, most: int = 4) -> None:
+        self._most = most
+        self._kept: deque[NDArray[np.float32]] = deque()
+
+    def take(self, size: int) -> Tensor:
+        """(size,) float32 of any content."""
+        for _ in range(len(self._kept)):
+            buffer = self._kept.popleft()
+            free = sys.getrefcount(buffer) == 2  # by this name and as the argument; a tensor's storage is a third
+            if free and len(buffer) < size:
+                continue  # too small by now: let it go
+            self._kept.append(buffer)
+            if free:
+                return torch.from_numpy(buffer[:size])
+        # numpy asks for huge pages: half the time of torch's fresh memory
+        buffer = np.empty(size, np.float32)
+        if len(self._kept) < self._most:
+            self._kept.append(buffer)
+        return torch.from_numpy(buffer[:size])
 
 
 _BITS = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1)
@@ -256,121 +267,18 @@ def _look_up(table: Tensor, bytes_: Tensor) -> Tensor:
     return table.to(bytes_.device).index_select(0, bytes_.reshape(-1).int()).view(bytes_.shape)
 
 
-def save_npz(path: str | Path, splits: Mapping[str, StackArrays], manifest: Mapping) -> None:
-    """Write a whole dataset as one compressed file of plain arrays.
+def to_batch(samples: Sequence[Sample], world: World = PAPER_WORLD) -> Batch:
+    """Collate decoded samples into one batch: `wds.WebDataset(urls).map(decode).batched(64, collation_fn=to_batch)`.
 
     Args:
-        path: Ends in `.npz`.
-        splits: Any of train, validation, test; a split's place in that list is its number in the file.
-        manifest: The dataset's manifest, as JSON allows.
+        samples: B of them, as :func:`stackgen.data.shards.decode` gives them.
+        world: World of the dataset; `functools.partial(to_batch, world=dataset.world)` for another than the paper's.
+
+    Returns:
+        The same batch as from :class:`stackgen.data.datamodule.StackDataModule`; see :meth:`StackTensors.batch`.
 
     Raises:
-        StackgenError: If there is nothing to write, or it cannot be written.
+        StackgenError: If a sample does not fit the world.
     """
-    path = Path(path)
-    names = [name for name in SPLITS if name in splits]
-    if not names or len(names) != len(splits) or path.suffix != ".npz":
-        raise StackgenError(f"compact dataset: {path} must end in .npz and hold some of {', '.join(SPLITS)}")
-    parts: dict[str, Any] = {
-        field: np.concatenate([getattr(splits[name], field) for name in names]) for field in FIELDS
-    }
-    parts["split"] = np.repeat(
-        np.array([SPLITS.index(name) for name in names], np.uint8), [len(splits[name]) for name in names]
-    )
-    parts["manifest"] = np.array(json.dumps(manifest))
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.npz")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(temporary, allow_pickle=False, **parts)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise StackgenError(f"cannot write {path}: {error.strerror or error}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def load_npz(path: str | Path) -> tuple[dict[str, StackArrays], dict]:
-    """Inverse of :func:`save_npz`: the splits it holds, and the manifest.
-
-    Raises:
-        StackgenError: If the file is missing, broken, or not such a file.
-    """
-    if not is_remote(path) and not Path(path).exists():
-        raise StackgenError(
-            f"no dataset at {path}: `stackgen generate` makes a folder, `stackgen dataset export` a .npz of it"
-        )
-    try:
-        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as file:
-            fields = {name: file[name] for name in FIELDS}
-            split, manifest = file["split"], json.loads(str(file["manifest"]))
-    except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
-        raise StackgenError(f"{path} is not a compact stackgen dataset: {_one_line(error)}") from error
-    if not isinstance(manifest, dict) or split.shape != fields["template"].shape:
-        raise StackgenError(f"{path} is not a compact stackgen dataset: manifest or split do not fit")
-    catalogue = manifest.get("catalogue")
-    everything = StackArrays(**fields, num_shapes=len(catalogue) if catalogue else len(PAPER_CATALOGUE))
-    return {str(name): everything.select(split == i) for i, name in enumerate(SPLITS) if (split == i).any()}, manifest
-
-
-def load_dataset(path: str | Path, splits: Iterable[str] = SPLITS) -> tuple[dict[str, StackArrays], dict]:
-    """The splits asked for, as far as they exist, and the manifest, of a dataset folder or a compact file.
-
-    Args:
-        path: Local, or as :mod:`stackgen.data.sources` says.
-        splits: Their names.
-
-    Raises:
-        StackgenError: If it is neither, has none of the splits, or a shard is damaged (the message names it).
-    """
-    wanted = tuple(splits)
-    if is_folder(path):
-        manifest, losses = load_manifest(path), Losses()
-        shards = {str(name): shards_of(manifest, path, name) for name in SPLITS if name in wanted}
-        found = {name: _fill(those, Frame.of(manifest), losses) for name, those in shards.items() if those}
-        losses.report(str(path))
-        facts = manifest.to_json()
-    else:
-        everything, facts = load_npz(path)
-        found = {name: arrays for name, arrays in everything.items() if name in wanted}
-    if not found:
-        raise StackgenError(f"dataset {path} has no {' or '.join(wanted)} split")
-    return found, facts
-
-
-def _fill(shards: Sequence[Shard], frame: Frame, losses: Losses) -> StackArrays:
-    """All samples of some shards; damage to one is an error, since it is found before anything was begun."""
-    total, count = sum(shard.samples for shard in shards), 0
-    # Not in parts that are then put together: that would take twice the memory.
-    fields: dict[str, NDArray[Any]] = {
-        "shapes": np.empty((total, frame.max_blocks), np.uint8),
-        "poses": np.empty((total, frame.max_blocks, 6), np.float32),
-        "silhouettes": np.empty((total, frame.image_size**2 // 8), np.uint8),
-        "template": np.empty(total, np.int64),
-    }
-    for shard in _tracked(shards):
-        decoded, lost = decode_sound(shard.read(), shard, frame)
-        losses.add(lost)
-        stop = count + len(decoded.positions)
-        if stop > total:
-            raise StackgenError(f"shard {shard.path} holds more samples than dataset.json says")
-        for name, column in fields.items():
-            column[count:stop] = getattr(decoded, name)
-        count = stop
-    if not count:
-        raise StackgenError("dataset: the shards hold no sample")
-    return StackArrays(**{name: column[:count] for name, column in fields.items()}, num_shapes=frame.num_shapes)
-
-
-def _tracked(shards: Sequence[Shard]) -> Iterable[Shard]:
-    """The shards, with a progress bar if reading them takes a while."""
-    if sum(shard.samples for shard in shards) < LONG and not is_remote(shards[0].path):
-        return shards
-    from rich.console import Console  # only where it is needed
-    from rich.progress import track
-
-    screen = Console(stderr=True)
-    return track(shards, "reading shards", console=screen, transient=True, disable=not screen.is_terminal)
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+    arrays = StackArrays.from_samples(samples, world)
+    return arrays.batch(np.arange(len(arrays)))

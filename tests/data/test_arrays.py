@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -10,13 +11,15 @@ import numpy as np
 import pytest
 import torch
 
-from stackgen.data.loading.arrays import StackArrays, load_dataset, load_npz, save_npz
-from stackgen.data.loading.buffers import Buffers
-from stackgen.data.loading.decoding import Frame, decode_shard
+from stackgen.data.arrays import Buffers, StackArrays
+from stackgen.data.compact import load_npz, save_npz
+from stackgen.data.dataset import Dataset
+from stackgen.data.decoding import decode_shard
 from stackgen.data.shards import Sample, encode_shard, read_shard
 from stackgen.errors import StackgenError
 from stackgen.geometry import mirror, silhouette
 from stackgen.stack import Stack
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, World
 
 FIELDS = ("shapes", "poses", "silhouettes", "template")
 BEYOND = np.array([1, 4], np.uint8)  # the second is no shape of the paper's catalogue
@@ -72,7 +75,7 @@ def test_a_mirrored_sample_is_the_mirrored_stack_and_its_silhouette(splits: dict
         stack = Stack(arrays.shapes[i][mask], arrays.poses[i][mask])
         expected = mirror(stack) if flags[i] else stack
         assert np.array_equal(got.shapes, expected.shapes) and np.array_equal(got.poses, expected.poses)
-        image = silhouette(stack)
+        image = silhouette(stack, PAPER_GRID)
         assert np.array_equal(batch["silhouette"][i].numpy() > 0, image[:, ::-1] if flags[i] else image)
 
 
@@ -110,24 +113,24 @@ def test_memory_is_used_again_once_it_is_free() -> None:
 def test_a_shard_decoded_at_once_is_the_same_as_sample_by_sample(
     samples: dict[str, list[Sample]], splits: dict[str, StackArrays], dataset: Path
 ) -> None:
-    decoded = decode_shard((dataset / "validation-000002.tar").read_bytes(), Frame(10, 4, 64))
+    decoded = decode_shard((dataset / "validation-000002.tar").read_bytes(), PAPER_WORLD)
     assert not decoded.broken and decoded.positions.tolist() == list(range(23))
-    whole = StackArrays.of(decoded, Frame(10, 4, 64))
-    assert equal(whole, StackArrays.from_samples(read_shard(dataset / "validation-000002.tar")))
+    whole = decoded.stacks
+    assert equal(whole, StackArrays.from_samples(read_shard(dataset / "validation-000002.tar"), PAPER_WORLD))
     assert equal(whole, splits["validation"])
 
 
 def test_whatever_bytes_a_shard_holds_samples_come_out_or_faults(samples: dict[str, list[Sample]]) -> None:
     content = encode_shard(samples["train-000000.tar"][:3])
-    frame, rng = Frame(10, 4, 64), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     used = len(content.rstrip(b"\0"))
     for _ in range(300):
         broken = bytearray(content)
         for place in rng.integers(0, used, rng.integers(1, 4)):
             broken[place] = rng.integers(256)
         for cut in (used, int(rng.integers(used))):
-            decoded = decode_shard(bytes(broken[:cut]), frame)
-            assert np.isfinite(decoded.poses).all() and len(decoded.positions) == len(decoded.shapes)
+            decoded = decode_shard(bytes(broken[:cut]), PAPER_WORLD)
+            assert np.isfinite(decoded.stacks.poses).all() and len(decoded.positions) == len(decoded.stacks)
             StackArrays.of(decoded, frame)  # it refuses what does not fit
 
 
@@ -152,32 +155,35 @@ def test_a_broken_sample_is_named_and_costs_no_other(
     sample: Sample, fault: str, samples: dict[str, list[Sample]]
 ) -> None:
     good = samples["train-000000.tar"][:2]
-    decoded = decode_shard(encode_shard([good[0], sample, good[1]]), Frame(10, 4, 64))
+    decoded = decode_shard(encode_shard([good[0], sample, good[1]]), PAPER_WORLD)
     assert decoded.broken == (fault,)
     assert decoded.positions.tolist() == [0, 2]
-    assert decoded.template.tolist() == [s.meta["template"] for s in good]
+    assert decoded.stacks.template.tolist() == [s.meta["template"] for s in good]
 
 
 def test_the_compact_file_is_read_back_as_written(
     dataset: Path, splits: dict[str, StackArrays], tmp_path: Path
 ) -> None:
-    manifest = load_dataset(dataset)[1]
+    manifest = Dataset.open(dataset).manifest
     save_npz(tmp_path / "small.npz", splits, manifest)
     assert [path.name for path in tmp_path.iterdir()] == ["small.npz"]
-    found, again = load_npz(tmp_path / "small.npz")
+    found, again = load_npz(str(tmp_path / "small.npz"))
     assert again == manifest and list(found) == ["train", "validation", "test"]
     assert all(equal(found[name], splits[name]) for name in found)
-    only = load_dataset(tmp_path / "small.npz", ("validation",))[0]
-    assert list(only) == ["validation"] and equal(only["validation"], splits["validation"])
+    compact = Dataset.open(tmp_path / "small.npz")
+    assert compact.is_compact and compact.splits == ("train", "validation", "test")
+    assert equal(compact.split("validation"), splits["validation"]) and compact.world == manifest.world
 
 
 @pytest.mark.parametrize("damage", ["missing", "text", "truncated", "pickled", "foreign", "wrong dtype"])
-def test_a_bad_compact_file_is_one_line(damage: str, splits: dict[str, StackArrays], tmp_path: Path) -> None:
+def test_a_bad_compact_file_is_one_line(
+    damage: str, dataset: Path, splits: dict[str, StackArrays], tmp_path: Path
+) -> None:
     path = tmp_path / "x.npz"
     if damage == "text":
         path.write_text("no arrays here")
     elif damage == "truncated":
-        save_npz(path, splits, {})
+        save_npz(path, splits, Dataset.open(dataset).manifest)
         path.write_bytes(path.read_bytes()[:1000])
     elif damage == "pickled":
         np.savez(path, shapes=np.array([{}], dtype=object))
@@ -187,10 +193,11 @@ def test_a_bad_compact_file_is_one_line(damage: str, splits: dict[str, StackArra
         a = splits["test"]
         np.savez(
             path, shapes=a.shapes, poses=a.poses.astype(np.float64), silhouettes=a.silhouettes,
-            template=a.template, split=np.zeros(len(a), np.uint8), manifest=np.array("{}"),
+            template=a.template, split=np.zeros(len(a), np.uint8),
+            manifest=np.array(json.dumps(Dataset.open(dataset).manifest.to_json())),
         )  # fmt: skip
     with pytest.raises(StackgenError) as caught:
-        load_npz(path)
+        Dataset.open(path)
     assert "\n" not in str(caught.value) and ("x.npz" in str(caught.value) or damage == "wrong dtype")
 
 
@@ -200,10 +207,10 @@ def test_arrays_that_do_not_fit_are_refused(splits: dict[str, StackArrays]) -> N
     gap[0, 0] = 255
     for shapes, poses in ((a.shapes[1:], a.poses), (gap, a.poses), (a.shapes, a.poses * np.nan)):
         with pytest.raises(StackgenError):
-            StackArrays(shapes, poses, a.silhouettes, a.template)
+            StackArrays(shapes, poses, a.silhouettes, a.template, 4)
+    sample = Sample("k", np.zeros(5, np.uint8), np.zeros((5, 6), np.float32), np.zeros((64, 64), bool), {"template": 0})
     with pytest.raises(StackgenError, match="more than 4"):
-        StackArrays.from_samples([Sample("k", np.zeros(5, np.uint8), np.zeros((5, 6), np.float32),
-                                         np.zeros((64, 64), bool), {"template": 0})], max_blocks=4)  # fmt: skip
+        StackArrays.from_samples([sample], World(PAPER_CATALOGUE, PAPER_GRID, 4))
 
 
 def test_pose_statistics_are_those_of_the_real_blocks(splits: dict[str, StackArrays]) -> None:
@@ -217,7 +224,7 @@ def test_pose_statistics_are_those_of_the_real_blocks(splits: dict[str, StackArr
 
 def test_arrays_need_neither_webdataset_nor_the_simulator_nor_lightning() -> None:
     code = (
-        "import sys, stackgen.data.loading.arrays; "
+        "import sys, stackgen.data.arrays; "
         "sys.exit(bool({'webdataset', 'pybullet', 'lightning', 'pytorch_lightning'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stackgen.data.generation.templates import Template, TemplateSettings, draw_template, realize
+from stackgen.data.generation.designs import Design, DesignSettings, draw_design, realize
 from stackgen.geometry import silhouette
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Grid
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Grid, World
 
 WIDTHS = [1, 2, 3, 1]
 TRIANGLE = 3
-STILL = TemplateSettings(displacement=0)
+STILL = DesignSettings(displacement=0)
 
 
-def draws(count: int, seed: int = 0) -> list[Template]:
+def draws(count: int, seed: int = 0) -> list[Design]:
     rng = np.random.default_rng(seed)
-    return [draw_template(rng) for _ in range(count)]
+    return [draw_design(rng, PAPER_WORLD) for _ in range(count)]
 
 
 def test_rows_are_filled_to_three_cells_and_never_wider_than_four() -> None:
@@ -39,9 +39,9 @@ def test_triangles_stand_in_the_top_row_alone_and_do() -> None:
     found = draws(300)
     assert not any(s == TRIANGLE for template in found for row in template.rows[:-1] for s, _ in row)
     assert any(s == TRIANGLE for template in found for s, _ in template.rows[-1])
-    everywhere = TemplateSettings(top_row_only=())
+    everywhere = DesignSettings(top_row_only=())
     rng = np.random.default_rng(0)
-    assert any(s == TRIANGLE for _ in range(20) for s, _ in draw_template(rng, everywhere).rows[0])
+    assert any(s == TRIANGLE for _ in range(20) for s, _ in draw_design(rng, PAPER_WORLD, everywhere).rows[0])
 
 
 def test_blocks_are_drawn_uniformly_among_those_that_fit() -> None:
@@ -68,25 +68,25 @@ def test_a_key_is_the_design_and_mirroring_twice_is_nothing() -> None:
     keys = {template.key for template in found}
     assert len(keys) > 250
     for template in found:
-        assert Template.from_key(template.key) == template
-        mirrored = template.mirrored(PAPER_CATALOGUE, PAPER_GRID)
-        assert mirrored.mirrored(PAPER_CATALOGUE, PAPER_GRID) == template
-        assert Template.from_key(mirrored.key) == mirrored
-    assert any(template != template.mirrored(PAPER_CATALOGUE, PAPER_GRID) for template in found)
+        assert Design.from_key(template.key) == template
+        mirrored = template.mirrored(PAPER_WORLD)
+        assert mirrored.mirrored(PAPER_WORLD) == template
+        assert Design.from_key(mirrored.key) == mirrored
+    assert any(template != template.mirrored(PAPER_WORLD) for template in found)
 
 
 def test_the_mirrored_design_has_the_mirrored_silhouette() -> None:
     rng = np.random.default_rng(0)
     for template in draws(20):
-        mirrored = template.mirrored(PAPER_CATALOGUE, PAPER_GRID)
-        here, there = (silhouette(realize(t, rng, STILL)) for t in (template, mirrored))
+        mirrored = template.mirrored(PAPER_WORLD)
+        here, there = (silhouette(realize(t, rng, PAPER_WORLD, STILL), PAPER_GRID) for t in (template, mirrored))
         assert (there == np.fliplr(here)).all()
 
 
 def test_without_displacement_blocks_fill_their_cells() -> None:
     rng = np.random.default_rng(0)
     for template in draws(50):
-        stack = realize(template, rng, STILL)
+        stack = realize(template, rng, PAPER_WORLD, STILL)
         wanted = [(s, left - 2 + WIDTHS[s] / 2, z + 0.5) for z, row in enumerate(template.rows) for s, left in row]
         assert [(int(s), *p[[0, 2]]) for s, p in zip(stack.shapes, stack.poses, strict=True)] == wanted
         assert not stack.poses[:, [1, 3, 4, 5]].any()
@@ -95,10 +95,10 @@ def test_without_displacement_blocks_fill_their_cells() -> None:
 @pytest.mark.parametrize("displacement", [0.1, 0.3])
 def test_displaced_blocks_stay_near_their_cells_and_out_of_each_other(displacement: float) -> None:
     rng = np.random.default_rng(0)
-    settings = TemplateSettings(displacement=displacement)
+    settings = DesignSettings(displacement=displacement)
     farthest = 0.0
     for template in draws(200):
-        here, there = realize(template, rng, STILL), realize(template, rng, settings)
+        here, there = realize(template, rng, PAPER_WORLD, STILL), realize(template, rng, PAPER_WORLD, settings)
         away = np.abs(there.poses - here.poses)
         assert away[:, 0].max() <= displacement + 1e-3 and not away[:, 1:].any()
         farthest = max(farthest, float(away[:, 0].max()))
@@ -111,11 +111,11 @@ def test_displaced_blocks_stay_near_their_cells_and_out_of_each_other(displaceme
 
 def test_same_stream_same_design_and_other_grids_work_too() -> None:
     assert draws(5) == draws(5) != draws(5, seed=1)
-    grid = Grid(width=6, height=2)
+    world = World(PAPER_CATALOGUE, Grid(width=6, height=2), 10)
     rng = np.random.default_rng(0)
     for _ in range(20):
-        template = draw_template(rng, TemplateSettings(minimum_fill=5), grid=grid)
+        template = draw_design(rng, world, DesignSettings(minimum_fill=5))
         assert len(template.rows) == 2
-        stack = realize(template, rng, STILL, grid=grid)
+        stack = realize(template, rng, world, STILL)
         assert np.abs(stack.poses[:, 0]).max() < 3 and stack.poses[:, 2].max() == 1.5
         assert all(5 <= sum(WIDTHS[s] for s, _ in row) <= 6 for row in template.rows)

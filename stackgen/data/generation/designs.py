@@ -10,13 +10,13 @@ import numpy as np
 
 from stackgen.errors import StackgenError
 from stackgen.stack import Stack
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Shape
+from stackgen.world import Shape, World
 
 _EPSILON = 1e-6  # [cell]
 
 
 @dataclass(frozen=True)
-class TemplateSettings:
+class DesignSettings:
     """How designs are drawn.
 
     Args:
@@ -29,13 +29,14 @@ class TemplateSettings:
     displacement: float = 0.1
     top_row_only: tuple[str, ...] = ("triangle",)
 
-    def check(self, catalogue: Catalogue, grid: Grid) -> None:
+    def check(self, world: World) -> None:
         """See that designs can be drawn with these settings, and that their blocks can stand.
 
         Raises:
             StackgenError: If a row cannot be filled, or a shape cannot stand or bear where it may be put.
         """
-        unknown = set(self.top_row_only) - {*catalogue.names, *TemplateSettings().top_row_only}
+        catalogue, grid = world.catalogue, world.grid
+        unknown = set(self.top_row_only) - {*catalogue.names, *DesignSettings().top_row_only}
         if unknown:
             raise StackgenError(f"template: top_row_only names {', '.join(sorted(unknown))}: not in the catalogue")
         lower = [shape for shape in catalogue if shape.name not in self.top_row_only]
@@ -46,9 +47,10 @@ class TemplateSettings:
                 f"template: displacement must be at least 0 and minimum_fill lie in 1..{grid.width}, the grid's width"
             )
         for shape in catalogue:
-            self._check_shape(shape, lower, grid)
+            self._check_shape(shape, lower, world)
 
-    def _check_shape(self, shape: Shape, lower: Sequence[Shape], grid: Grid) -> None:
+    def _check_shape(self, shape: Shape, lower: Sequence[Shape], world: World) -> None:
+        grid = world.grid
         name = f"template: shape {shape.name!r}"
         stands, bears = shape.level
         if not stands:
@@ -76,7 +78,7 @@ def _same_height(a: Shape, b: Shape) -> bool:
 
 
 @dataclass(frozen=True)
-class Template:
+class Design:
     """A design: rows from the bottom up, each a tuple of (shape index, left edge in cells)."""
 
     rows: tuple[tuple[tuple[int, int], ...], ...]
@@ -87,34 +89,29 @@ class Template:
         return "/".join(",".join(f"{shape}@{left}" for shape, left in row) for row in self.rows)
 
     @staticmethod
-    def from_key(key: str) -> Template:
+    def from_key(key: str) -> Design:
         """Inverse of :attr:`key`."""
         rows = (row.split(",") for row in key.split("/"))
-        return Template(tuple(tuple((int(s), int(x)) for s, x in (b.split("@") for b in row)) for row in rows))
+        return Design(tuple(tuple((int(s), int(x)) for s, x in (b.split("@") for b in row)) for row in rows))
 
-    def mirrored(self, catalogue: Catalogue, grid: Grid) -> Template:
+    def mirrored(self, world: World) -> Design:
         """The design reflected left to right."""
-        return Template(
+        return Design(
             tuple(
-                tuple((s, grid.width - left - cells_wide(catalogue[s])) for s, left in reversed(row))
+                tuple((s, world.grid.width - left - cells_wide(world.catalogue[s])) for s, left in reversed(row))
                 for row in self.rows
             )
         )
 
 
-def draw_template(
-    rng: np.random.Generator,
-    settings: TemplateSettings | None = None,
-    catalogue: Catalogue = PAPER_CATALOGUE,
-    grid: Grid = PAPER_GRID,
-) -> Template:
+def draw_design(rng: np.random.Generator, world: World, settings: DesignSettings | None = None) -> Design:
     """Fill the grid row by row with random blocks, never wider than the grid, until a row holds the
     minimum; the cells left free go, each on its own, to random gaps between and beside the blocks.
 
     The blocks of a row are of one height, that of its first; rows follow until none fits below the
     grid's upper edge.
     """
-    settings = settings or TemplateSettings()
+    settings, catalogue, grid = settings or DesignSettings(), world.catalogue, world.grid
     widths = [cells_wide(shape) for shape in catalogue]
     heights = [shape.size[2] for shape in catalogue]
     rows: list[tuple[tuple[int, int], ...]] = []
@@ -141,22 +138,16 @@ def draw_template(
             placed.append((shape, left))
             left += widths[shape]
         rows.append(tuple(placed))
-    return Template(tuple(rows))
+    return Design(tuple(rows))
 
 
-def realize(
-    template: Template,
-    rng: np.random.Generator,
-    settings: TemplateSettings | None = None,
-    catalogue: Catalogue = PAPER_CATALOGUE,
-    grid: Grid = PAPER_GRID,
-) -> Stack:
+def realize(design: Design, rng: np.random.Generator, world: World, settings: DesignSettings | None = None) -> Stack:
     """The template's blocks at their SE(3) poses, each displaced along x; neighbours that the
     displacement pushed into each other are moved apart, half the overlap each, as contact would."""
-    settings = settings or TemplateSettings()
+    settings, catalogue, grid = settings or DesignSettings(), world.catalogue, world.grid
     shapes, poses = [], []
     bottom = 0.0
-    for row in template.rows:
+    for row in design.rows:
         widths = np.array([catalogue[s].size[0] for s, _ in row])
         cells = np.array([cells_wide(catalogue[s]) for s, _ in row])
         lefts = np.array([left for _, left in row]) - grid.width / 2
