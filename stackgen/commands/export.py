@@ -1,4 +1,4 @@
-"""stackgen export: from a training checkpoint to weights that can be given away."""
+"""stackgen export: turn a training checkpoint into weights that can be given away."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ def main(checkpoint: Path, out: Path, half: bool = False) -> None:
     """Write the weights of a checkpoint as safetensors, with a JSON card beside them.
 
     Args:
-        checkpoint: Of `stackgen fit`.
-        out: File to write, ending in .safetensors; the card gets the same name and .json.
-        half: Store matrices as 16-bit floats: half the size.
+        checkpoint: Checkpoint of `stackgen fit`, or the folder of a run.
+        out: File to write, ending in .safetensors; the card gets the same name with .json.
+        half: Whether to store matrices as 16-bit floats, which halves the size.
     """
     from stackgen.models.weights import export_checkpoint
 
@@ -31,8 +31,8 @@ COMMAND = Command(
     stackgen export runs/ddpm-small --out ddpm-small.safetensors
     stackgen export runs/tran-reg --out tran-reg.safetensors --half
     """,
-    flags={"half": "Store matrices as 16-bit floats: half the size."},
-    files=Files("checkpoint", "CHECKPOINT", "A .ckpt of `stackgen fit`, or the folder of a run."),
+    flags={"half": "Store matrices as 16-bit floats, which halves the size."},
+    files=Files("checkpoint", "CHECKPOINT", "Checkpoint (.ckpt) of `stackgen fit`, or the folder of a run."),
 )
 
 

@@ -1,4 +1,4 @@
-"""stackgen show: the structures of a file as a picture and as a page to turn them in."""
+"""stackgen show: draw the stacks of a file as a picture and as a page that turns them."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from stackgen.viz.render import contact_sheet, save_image
 
 
 def main(file: Path, out: Path | None = None, open: bool = False) -> None:
-    """Draw the structures of a stacks file: a picture, and a page that shows them in 3-D.
+    """Draw the stacks of a stacks.json: one picture, and a page that shows them in 3-D.
 
     Args:
-        file: A stacks.json.
-        out: The picture to write, PNG or JPEG, with the page beside it as .html; by default beside the file.
+        file: The stacks.json.
+        out: Picture to write, PNG or JPEG; the page goes beside it as .html. By default both go beside the file.
         open: Whether to open the page in a browser.
     """
     content = read_stacks(file)
@@ -40,7 +40,7 @@ COMMAND = Command(
     stackgen show out/arch/stacks.json --open
     stackgen show mine.json --out pictures/mine.png
     """,
-    files=Files("file", "FILE", "A stacks.json."),
+    files=Files("file", "FILE", "File of stacks (stacks.json)."),
     flags={"open": "Open the page in a browser."},
 )
 
