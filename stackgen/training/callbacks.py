@@ -11,28 +11,28 @@ import torch
 from torch import Tensor
 
 from stackgen._lightning import pl
-from stackgen.data.loading.arrays import Batch
+from stackgen.data.arrays import Batch
 from stackgen.errors import StackgenError
-from stackgen.evaluation.metrics import SCENE_METRICS, SceneMetric, SceneScore
-from stackgen.evaluation.protocol import Scene, batch_seed, judge, scenes_of_batch
+from stackgen.evaluation.metrics import SCENE_METRICS
+from stackgen.evaluation.protocol import Scene, batch_seed, check_scenes, scenes_of_batch
+from stackgen.models.weights import read_weights
 from stackgen.protocols import StabilityChecker, StackSampler, Verdict
 from stackgen.stack import Stack
 from stackgen.training.plots import log_picture, silhouette_sheet
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Grid
 
 Part = tuple[float, float]
 """A sum, and the weight that it is to be divided by."""
 
 RAW_WEIGHTS = "raw_state_dict"
-"""Key of the not averaged weights in a checkpoint; its `state_dict` holds the averaged ones."""
+"""Key of the weights in training in a checkpoint; its `state_dict` holds the averaged ones."""
 
 
 class StartFrom(pl.Callback):
     """Start training from other weights, to fine-tune them; list it before EMA.
 
     Args:
-        weights: A name, a `.safetensors` file or a `.ckpt` of the same architecture; parts that it lacks
-            (such as an embedding that was added since) begin as they would without it.
+        weights: Weights of the same architecture: a name, a `.safetensors` file, a `.ckpt` or a run folder. Parts
+            that they lack (such as an embedding that was added since) begin as they would without them.
     """
 
     def __init__(self, weights: str) -> None:
@@ -42,31 +42,27 @@ class StartFrom(pl.Callback):
         """Load them, unless the fit resumes from a checkpoint of its own."""
         if trainer.ckpt_path:
             return
-        from stackgen.models.weights import (
-            read_weights,  # it stands above the models, as this file does not
-            resolve_weights,
-        )
-
-        tensors, _ = read_weights(resolve_weights(self.weights))
+        tensors, _ = read_weights(self.weights)
+        wrong = StackgenError(f"StartFrom: {self.weights} does not fit the model of the configuration")
         try:
             missing, foreign = pl_module.model.load_state_dict(tensors, strict=False)  # type: ignore[union-attr]
         except RuntimeError as error:
-            raise StackgenError(f"StartFrom: {self.weights} does not fit the model of the configuration") from error
+            raise wrong from error
         if foreign or len(missing) > len(tensors) // 2:
-            raise StackgenError(f"StartFrom: {self.weights} does not fit the model of the configuration")
+            raise wrong
         if missing:
-            print(f"StartFrom: {self.weights} has no {', '.join(missing)}: begun afresh")
+            print(f"StartFrom: {self.weights} has no {', '.join(missing)}, which begins untrained")
 
 
 class Compile(pl.Callback):
-    """Compiles parts of the network with torch.compile for the training steps, in place: weights keep their names.
+    """Compile parts of the network with torch.compile for the training steps, in place: weights keep their names.
 
     Validation and sampling see other sizes and modes, each a compilation of its own; they run as written.
 
     Args:
-        parts: Of the training module, by their names in it.
-        backend: Of torch.compile; `inductor` asks for a C++ compiler on a CPU.
-        mode: Of that backend, such as `reduce-overhead` or `max-autotune`.
+        parts: Names of the parts in the training module.
+        backend: Backend of torch.compile; `inductor` asks for a C++ compiler on a CPU.
+        mode: Mode of that backend, such as `reduce-overhead` or `max-autotune`.
         dynamic: Whether one compilation is for all sizes; null compiles for the first size, and for all at the second.
     """
 
@@ -111,6 +107,10 @@ class EMA(pl.Callback):
     it, to resume from), and when the fit ends it stays in the module. Checkpoints of weights alone
     (`save_weights_only`) reach no callback and hold the weights in training.
 
+    Lightning's EMAWeightAveraging is not its base: it copies the module before the network is built, takes the
+    average back out before callbacks listed later can sample with it, and mixes up the two in a checkpoint that
+    is saved while validating.
+
     Args:
         decay: Share of the old average that an update keeps.
         warmup: Whether a young average keeps less.
@@ -120,23 +120,19 @@ class EMA(pl.Callback):
         if not 0 <= decay < 1:
             raise StackgenError(f"EMA: decay must lie in [0, 1), got {decay}")
         self.decay, self.warmup = decay, warmup
-        self.updates = 0
-        self._names: list[str] = []
-        self._live: list[Tensor] = []  # the module's own tensors
-        self._other: list[Tensor] = []  # the average; while swapped, the weights in training
+        self.updates = self._step = 0
+        self._live: dict[str, Tensor] = {}  # the module's own tensors
+        self._other: dict[str, Tensor] = {}  # the average; while swapped, the weights in training
         self._swapped = False
-        self._step = 0
         self._raw: dict[str, Tensor] | None = None  # of the checkpoint that is being resumed
 
     def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Begin with the weights as they are: fresh, or averaged ones of a checkpoint."""
-        state = {n: t for n, t in pl_module.state_dict().items() if t.is_floating_point()}
-        self._names, self._live = list(state), list(state.values())
-        self._other = [tensor.clone() for tensor in self._live]
+        self._live = {name: t for name, t in pl_module.state_dict().items() if t.is_floating_point()}
+        self._other = {name: t.clone() for name, t in self._live.items()}
         self._swapped = False
         if self._raw is not None:
-            with torch.no_grad():
-                torch._foreach_copy_(self._live, [self._raw[name].to(t) for name, t in state.items()])
+            pl_module.load_state_dict(self._raw, strict=False)  # counters are not among them
             self._raw = None
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -152,16 +148,17 @@ class EMA(pl.Callback):
         self._step = trainer.global_step
         keep = min(self.decay, (1 + self.updates) / (10 + self.updates)) if self.warmup else self.decay
         with torch.no_grad():
-            torch._foreach_lerp_(self._other, self._live, 1 - keep)
+            torch._foreach_lerp_([*self._other.values()], [*self._live.values()], 1 - keep)
         self.updates += 1
 
     def _swap(self, averaged: bool) -> None:
         """Exchange the module's weights and the others, unless they are as asked for."""
         if averaged != self._swapped and self._live:
+            live, other = [*self._live.values()], [*self._other.values()]
             with torch.no_grad():
-                live = [tensor.clone() for tensor in self._live]
-                torch._foreach_copy_(self._live, self._other)
-                torch._foreach_copy_(self._other, live)
+                kept = [tensor.clone() for tensor in live]
+                torch._foreach_copy_(live, other)
+                torch._foreach_copy_(other, kept)
             self._swapped = averaged
 
     def on_validation_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -180,12 +177,11 @@ class EMA(pl.Callback):
     def on_save_checkpoint(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """The average as the checkpoint's weights, those in training beside them."""
-        if not self._live:
-            return
-        average, raw = (self._live, self._other) if self._swapped else (self._other, self._live)
-        checkpoint[RAW_WEIGHTS] = dict(zip(self._names, raw, strict=True))
-        checkpoint["state_dict"] = {**checkpoint["state_dict"], **dict(zip(self._names, average, strict=True))}
+        """Save the average as the checkpoint's weights, those in training beside them."""
+        if self._live:
+            average, raw = (self._live, self._other) if self._swapped else (self._other, self._live)
+            checkpoint["state_dict"] = {**checkpoint["state_dict"], **average}
+            checkpoint[RAW_WEIGHTS] = dict(raw)
 
     def on_load_checkpoint(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
@@ -203,19 +199,18 @@ class EMA(pl.Callback):
 
 
 class SampleQuality(pl.Callback):
-    """Every few epochs, and when only validating, samples validation scenes with their true lists and scores them.
+    """Sample validation scenes with their true block lists, every few epochs and when only validating, and score them.
 
     The module's `sampler()` gives the StackSampler; metrics are logged as `sample/<name>`, a picture of some
-    scenes as `sample/scenes`. Without a checker only what needs no physics is logged; whoever builds the
-    trainer may set `checker`, and the command line does.
+    scenes as `sample/scenes`. Without a checker, which the command line sets, only what needs no physics is logged.
 
     Args:
-        every_n_epochs: 0 never samples.
-        num_scenes: The first of the validation split, over all processes.
-        num_samples: Stacks per scene.
-        seed: The same noise each time, so that epochs compare.
-        checker: The physics.
-        num_pictures: Scenes in the picture; 0 draws none.
+        every_n_epochs: Validations from one sampling to the next; 0 never samples.
+        num_scenes: Number of scenes, the first of the validation split, over all processes.
+        num_samples: Number of stacks per scene.
+        seed: Seed of the sampler, the same each time, so that epochs compare.
+        checker: Says which stacks stand; null logs only what needs no physics.
+        num_pictures: Number of scenes in the picture; 0 draws none.
     """
 
     def __init__(
@@ -260,65 +255,51 @@ class SampleQuality(pl.Callback):
             self._batches.append({name: tensor[:missing] for name, tensor in batch.items()})
 
     def on_validation_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Sample, judge and log; the averaged weights are in the module now."""
+        """Sample, check and log; the averaged weights are in the module now."""
         if not self._batches:
             return
         make_sampler: Any = pl_module.sampler  # of our modules; Lightning knows nothing of it
         sampler: StackSampler = make_sampler()
-        catalogue = getattr(sampler, "catalogue", PAPER_CATALOGUE)
-        scenes = [scene for batch in self._batches for scene in scenes_of_batch(batch, catalogue)]
+        scenes = [s for batch in self._batches for s in scenes_of_batch(batch, sampler.world.catalogue)]
         self._batches = []
         start = time.perf_counter()
-        stacks = self.draw(sampler, scenes, trainer.global_rank)
+        stacks = self._draw(sampler, scenes, trainer.global_rank)
         rate = len(scenes) * self.num_samples, time.perf_counter() - start
-        parts = {**self.measure(sampler, scenes, stacks), "stacks_per_second": rate}
-        values = _over_processes(trainer, parts)  # the same on all of them
-        pl_module.log_dict({f"sample/{name}": value for name, value in values.items()}, sync_dist=True)
+        for name, (total, weight) in {**self._measure(sampler, scenes, stacks), "stacks_per_second": rate}.items():
+            # Weighted, so that the scenes of all processes count alike; NaN where no process has any weight.
+            mean = total / weight if weight else 0.0
+            pl_module.log(f"sample/{name}", mean, batch_size=float(weight), sync_dist=True)  # type: ignore[arg-type]
         if self.num_pictures and trainer.is_global_zero:
             firsts, shown = scenes[: self.num_pictures], [samples[0] for samples in stacks[: self.num_pictures]]
-            verdicts = [self.checker.check(stack) if self.checker else None for stack in shown]
-            log_picture(trainer, "sample/scenes", silhouette_sheet(firsts, shown, verdicts, _grid(sampler)))
+            verdicts = self.checker.check_all(shown) if self.checker else [None] * len(shown)
+            log_picture(trainer, "sample/scenes", silhouette_sheet(firsts, shown, verdicts, sampler.world.grid))
 
-    def draw(self, sampler: StackSampler, scenes: list[Scene], rank: int = 0) -> list[list[Stack]]:
+    def _draw(self, sampler: StackSampler, scenes: list[Scene], rank: int) -> list[list[Stack]]:
         """Stacks for some scenes, the same for the same weights."""
         silhouettes, counts = np.stack([s.silhouette for s in scenes]), np.stack([s.counts for s in scenes])
         return sampler.sample_batch(silhouettes, counts, self.num_samples, batch_seed(self.seed, 0, rank))
 
-    def measure(self, sampler: StackSampler, scenes: list[Scene], stacks: list[list[Stack]]) -> dict[str, Part]:
-        """The figures of some scenes, by name, each as a sum and the weight that it is to be divided by."""
-        scores = [r.score for r in judge(scenes, stacks, self.checker or _NoPhysics(), _grid(sampler))]
+    def _measure(self, sampler: StackSampler, scenes: list[Scene], stacks: list[list[Stack]]) -> dict[str, Part]:
+        """The metrics of some scenes, each as a sum and the weight that it is to be divided by."""
+        scores = [r.score for r in check_scenes(scenes, stacks, self.checker or _NoPhysics(), sampler.world)]
         names = SCENE_METRICS if self.checker else ("diversity", "front_iou_before_physics")
-        return {name: _sum(SCENE_METRICS[name], scores) for name in names}
+        parts = {name: np.sum([SCENE_METRICS[name](score) for score in scores], axis=0) for name in names}
+        return {name: (float(total), float(weight)) for name, (total, weight) in parts.items()}
 
 
-def _grid(sampler: StackSampler) -> Grid:
-    return getattr(sampler, "grid", PAPER_GRID)
-
-
-class _NoPhysics:
-    """Stands in for a checker where there is none: nothing moves. For figures that ignore physics."""
+class _NoPhysics(StabilityChecker):
+    """Stands in for a checker where there is none, for metrics that ignore physics: nothing moves."""
 
     def check(self, stack: Stack) -> Verdict:
+        """See StabilityChecker."""
         return Verdict(True, np.zeros(len(stack), bool), np.zeros(len(stack)), stack)
 
 
-def _sum(metric: SceneMetric, scores: list[SceneScore]) -> Part:
-    totals, weights = zip(*(metric(score) for score in scores), strict=True)
-    return sum(totals), sum(weights)
-
-
-def _over_processes(trainer: pl.Trainer, parts: dict[str, Part]) -> dict[str, float]:
-    """The mean of each figure, all processes' scenes counting alike; NaN where it does not exist."""
-    local = torch.tensor(list(parts.values()), device=trainer.strategy.root_device)
-    sums = trainer.strategy.reduce(local, reduce_op="sum").tolist()
-    return {name: total / weight if weight else float("nan") for name, (total, weight) in zip(parts, sums, strict=True)}
-
-
 class Throughput(pl.Callback):
-    """Logs `train/samples_per_second` over all processes, of training steps and their data alone.
+    """Log `train/samples_per_second` over all processes, of training steps and their data alone.
 
     Args:
-        every_n_steps: Batches averaged over.
+        every_n_steps: Number of batches averaged over.
     """
 
     def __init__(self, every_n_steps: int = 50) -> None:

@@ -31,7 +31,7 @@ _INK: Colour = (40, 42, 48)
 _LIGHT: Colour = (238, 240, 244)
 
 
-class StepFigures(pl.Callback):
+class StepMetrics(pl.Callback):
     """Logs `train/learning_rate` and `train/gradient_norm`, that of all gradients together before they are clipped.
 
     Args:
@@ -40,7 +40,7 @@ class StepFigures(pl.Callback):
 
     def __init__(self, every_n_steps: int | None = None) -> None:
         if every_n_steps is not None and every_n_steps < 1:
-            raise StackgenError(f"StepFigures: every_n_steps must be at least 1, got {every_n_steps}")
+            raise StackgenError(f"StepMetrics: every_n_steps must be at least 1, got {every_n_steps}")
         self.every_n_steps = every_n_steps
 
     def on_before_optimizer_step(
@@ -105,9 +105,9 @@ def silhouette_sheet(
     for number, (scene, stack, verdict) in enumerate(zip(scenes, stacks, verdicts, strict=True)):
         x, y = _HEADS + number % _ACROSS * step, _GAP + number // _ACROSS * band
         tone = FALLEN if verdict is not None and not verdict.stable else _INK
-        masks = [(scene.silhouette, _INK), (silhouette(stack, "front", grid), _INK)]
+        masks = [(scene.silhouette, _INK), (silhouette(stack, grid, "front"), _INK)]
         if verdict is not None:
-            masks.append((silhouette(verdict.settled, "front", grid), tone))
+            masks.append((silhouette(verdict.settled, grid, "front"), tone))
             text, colour = ("stands", _GOOD) if verdict.stable else (f"{int(verdict.fell.sum())} fell", FALLEN)
             pen.text((x, y + 3 * step + _CAPTION // 2 - _GAP), text, fill=colour, font=font, anchor="lm")
         for row, (mask, ink) in enumerate(masks):

@@ -14,13 +14,13 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 from stackgen._lightning import pl
-from stackgen.data.loading.arrays import Batch, StackArrays
+from stackgen.data.arrays import Batch, StackArrays
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette
-from stackgen.protocols import Verdict
+from stackgen.protocols import StabilityChecker, Verdict
 from stackgen.stack import Stack, shapes_of
 from stackgen.training.callbacks import EMA, RAW_WEIGHTS, Compile, SampleQuality, Throughput
-from stackgen.world import Mask
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Mask
 
 pytestmark = pytest.mark.filterwarnings("ignore")
 
@@ -202,6 +202,8 @@ def test_an_impossible_decay_is_one_line() -> None:
 class Row:
     """A sampler that puts the blocks side by side, the first sample of each scene in the air."""
 
+    world, settings, card = PAPER_WORLD, dict[str, Any](), dict[str, Any]()
+
     def __init__(self) -> None:
         self.asked: list[tuple[int, int, int]] = []
 
@@ -216,7 +218,7 @@ class Row:
         return stacks
 
 
-class Floor:
+class Floor(StabilityChecker):
     """A checker by which everything above the ground falls."""
 
     def check(self, stack: Stack) -> Verdict:
@@ -240,8 +242,8 @@ def one_cube_scenes(count: int) -> StackArrays:
     poses[:, 0, 2] = 0.5
     shapes = np.full((count, 10), 255, np.uint8)
     shapes[:, 0] = 0
-    image = np.packbits(silhouette(Stack(np.array([0]), np.array([[0, 0, 0.5, 0, 0, 0]]))))
-    return StackArrays(shapes, poses, np.tile(image, (count, 1)), np.arange(count))
+    image = np.packbits(silhouette(Stack(np.array([0]), np.array([[0, 0, 0.5, 0, 0, 0]])), PAPER_GRID))
+    return StackArrays(shapes, poses, np.tile(image, (count, 1)), np.arange(count), len(PAPER_CATALOGUE))
 
 
 def scene_batches(arrays: StackArrays, size: int) -> DataLoader[Any]:
