@@ -1,11 +1,11 @@
-"""stackgen build: a UR5 builds a structure, in simulation or for real."""
+"""stackgen build: an arm builds a structure, in simulation or for real."""
 
 from __future__ import annotations
 
-import json
+import math
 import os
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,260 +18,201 @@ from stackgen.commands.parsing import Command, Files
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.commands.real_arm import RealArm, build_for_real, check_options, placed_before, write_sheet
 from stackgen.errors import StackgenError
-from stackgen.geometry import iou
-from stackgen.io.files import write_atomically
-from stackgen.io.stacks_file import Entry, StacksFile, read_stacks, write_stacks
+from stackgen.io.files import write_json
+from stackgen.io.stacks_file import StackEntry, StacksFile, read_stacks, write_stacks
+from stackgen.robot.planning.build_order import Strategy
 from stackgen.robot.planning.kinematics import SolverName
-from stackgen.robot.planning.order import Strategy
-from stackgen.robot.workcell import Cell, Grasp
+from stackgen.robot.workcell import Grasp, Workcell
 from stackgen.stack import format_block_list
-from stackgen.world import Grid, Mask
 
 if TYPE_CHECKING:
-    from stackgen.robot.build import Design
-    from stackgen.robot.planning.plan import BuildPlan
-    from stackgen.robot.report import BuildReport
-    from stackgen.sim.physics import Physics
+    from stackgen.robot.build import PlannedBuild
+    from stackgen.robot.build_report import BuildReport
 
 
-def main(
-    file: Path | None = None,
-    stack: int = 1,
-    from_image: Path | None = None,
-    inventory: str | None = None,
-    weights: str = DEFAULT,
-    budget: str | None = None,
-    order: Strategy = "safest",
-    grasp: Grasp = "jaws",
-    solver: SolverName = "urdf",
-    noise_mm: float = 0.0,
-    noise_deg: float = 0.0,
-    seed: int = 0,
-    out: Path = Path("out/build"),
-    video: Path | None = None,
-    gui: bool = False,
-    cell: Cell = Cell(),  # noqa: B008 - frozen
-    execute: bool = False,
-    yes: bool = False,
-    resume: bool = False,
-    real: RealArm = RealArm(),  # noqa: B008 - frozen
-) -> int:
+@dataclass(frozen=True)
+class Wanted:
+    """What is built, and how it is planned.
+
+    Args:
+        stack: Number of the stack in the file, from 1.
+        from_image: Picture, photo of a sketch, or depth frame (as for `stackgen capture`) to build instead of a file:
+            block list, verified stacks, the best of them.
+        inventory: With --from_image, the blocks that there are, such as cube=4,rectangle=3.
+        weights: With --from_image, weights of the sampler: a name, .safetensors, .ckpt or run folder.
+        budget: With --from_image, time such as 5s or number of draws that finding a stack may cost.
+        seed: Seed of the noise, and with --from_image of the stacks.
+        order: Order of placing: the safest, in which every state stands, or the paper's greedy one.
+        solver: Inverse-kinematics solver.
+        out: Folder for build.json (the report), stacks.json (the blocks as built) and build.png (their picture).
+        cell: The robot's workcell.
+    """
+
+    stack: int = 1
+    from_image: Path | None = None
+    inventory: str | None = None
+    weights: str = DEFAULT
+    budget: str | None = None
+    seed: int = 0
+    order: Strategy = "safest"
+    solver: SolverName = "urdf"
+    out: Path = Path("out/build")
+    cell: Workcell = field(default_factory=Workcell)
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """What only the simulated arm does.
+
+    Args:
+        grasp: Grasp by friction between parallel jaws, or by a fixed constraint, which is faster.
+        noise_mm: Standard deviation of the blocks' places from where the robot believes them, in x and y [mm].
+        noise_deg: Standard deviation of their turn [deg].
+        video: Film to write: an .mp4 (H.264, which browsers play) or a .gif, eight times as fast as the arm.
+        gui: Show the build in a window, where there is a display.
+    """
+
+    grasp: Grasp = "jaws"
+    noise_mm: float = 0.0
+    noise_deg: float = 0.0
+    video: Path | None = None
+    gui: bool = False
+
+    @property
+    def asked_for(self) -> bool:
+        """Whether any of it was asked for."""
+        return self != Simulation()
+
+
+def main(wanted: Wanted, simulation: Simulation, real: RealArm, file: Path | None = None) -> int:
     """Build a structure with a UR5 and parallel jaws, simulated or real; exit code 1 if it does not stand in the end.
 
     Args:
-        file: A stacks.json.
-        stack: Which of its stacks, counted from 1.
-        from_image: Build what is in a picture, the photo of a sketch, or a depth frame (as for `stackgen capture`),
-            instead: block list, verified stacks, the best of them.
-        inventory: With --from_image, the blocks there are, such as cube=4,rectangle=3.
-        weights: With --from_image, the sampler's: a name, a .safetensors, a .ckpt or the folder of a run.
-        budget: With --from_image, what finding a stack may cost: a time such as 5s or a number of draws.
-        order: The safest order, in which every state stands, or the paper's greedy one.
-        grasp: By friction between parallel jaws, or by a fixed constraint, which is faster.
-        solver: Of the inverse kinematics.
-        noise_mm: How far the blocks lie from where the robot believes, along x and along y: standard deviation [mm].
-        noise_deg: How far they are turned: standard deviation [deg].
-        seed: Of the noise, and with --from_image of the stacks.
-        out: Folder for build.json, the report, stacks.json, what was built, and build.png, a picture of it.
-        video: Film the build: an .mp4 (H.264, which browsers play) or a .gif, eight times as fast as the arm.
-        gui: Show the build in a window.
-        cell: The robot's cell.
-        execute: Have the real arm move; without it everything but that is done.
-        yes: Do not ask before the real arm moves.
-        resume: Go on with the next block of a real build that was interrupted.
+        wanted: What is built.
+        simulation: What the simulated arm does.
         real: Who builds, and what a real arm needs.
+        file: A stacks.json.
     """
-    from stackgen.robot.simulated.film import check_film
-    from stackgen.robot.simulated.window import require_display
+    from stackgen.robot.candidates import first_buildable
+    from stackgen.sim.physics import Physics
 
-    if noise_mm < 0 or noise_deg < 0 or seed < 0:
-        raise StackgenError("--noise_mm, --noise_deg and --seed must be at least 0")
-    only_simulated = gui or video is not None or noise_mm > 0 or noise_deg > 0 or grasp != "jaws"
-    check_options(real, execute, yes, resume, only_simulated)
-    placed = placed_before(out, resume)
-    if video is not None:
-        check_film(video)
-    if gui:
-        require_display()
-    content, entries = (
-        _from_file(file, stack, inventory, budget)
-        if from_image is None
-        else _from_image(from_image, file, inventory, weights, budget, seed)
-    )
-    physics = _physics(content)
-    wanted, plan = _planned(entries, cell, physics, order, solver, placed)
+    placed = _check_options(wanted, simulation, real)
+    content = _from_file(file, wanted) if wanted.from_image is None else _from_image(wanted.from_image, file, wanted)
+    physics = replace(Physics.of_world(content.physics), cell_size=content.cell_size)
+    with progress_bar("plan", len(content.stacks[0])) as (advance, say):
+        planned = first_buildable(
+            content.stacks,
+            wanted.cell,
+            physics,
+            strategy=wanted.order,
+            solver=wanted.solver,
+            placed=placed,
+            on_block=advance,
+        )
+        if not planned.design.order.safe:
+            say(f"the greedy order is not safe: {planned.design.order.blocked}")
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        wanted.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise StackgenError(f"--out {out}: cannot be made: {error.strerror or error}") from error
-    write_sheet(real, plan, cell, physics.cell_size)
+        raise StackgenError(f"--out {wanted.out}: cannot be made: {error.strerror or error}") from error
+    write_sheet(real, planned)
     if real.arm != "simulation":
-        return build_for_real(plan, cell, real, out, execute, yes, resume)
-    noise = noise_mm / 1e3, float(np.radians(noise_deg)), seed
-    result = _built(wanted, plan, cell, physics, grasp, noise, content, gui, out / "build.png", video)
-    _write(out, result, content, cell, physics, noise)
+        return build_for_real(planned, real, wanted.out)
+    result = _built(planned, wanted, simulation, content)
+    _write(wanted, simulation, planned, content, result)
     _show(result)
-    written = [out, *([video] if video else [])]
+    written = [wanted.out, *([simulation.video] if simulation.video else [])]
     Console().print(f"wrote {' and '.join(map(str, written))}", highlight=False)
     return 0 if result.success else 1
 
 
-def _from_file(
-    file: Path | None, number: int, inventory: str | None, budget: str | None
-) -> tuple[StacksFile, list[Entry]]:
+def _check_options(wanted: Wanted, simulation: Simulation, real: RealArm) -> int:
+    """See that the options go together; return how many blocks stand already."""
+    from stackgen.robot.simulated.film import check_film
+    from stackgen.robot.simulated.window import require_display
+
+    if simulation.noise_mm < 0 or simulation.noise_deg < 0 or wanted.seed < 0:
+        raise StackgenError("--noise_mm, --noise_deg and --seed must be at least 0")
+    check_options(real, simulation.asked_for)
+    placed = placed_before(wanted.out, real.resume)
+    if simulation.video is not None:
+        check_film(simulation.video)
+    if simulation.gui:
+        require_display()
+    return placed
+
+
+def _from_file(file: Path | None, wanted: Wanted) -> StacksFile:
+    """Read the file; its one stack is the one to build."""
     if file is None:
         raise StackgenError("give a stacks.json, or a picture with --from_image")
-    if inventory is not None or budget is not None:
+    if wanted.inventory is not None or wanted.budget is not None:
         raise StackgenError("--inventory and --budget go with --from_image: a stacks.json names its blocks")
     content = read_stacks(file)
-    if not 1 <= number <= len(content.entries):
-        raise StackgenError(f"{file}: --stack must lie in 1..{len(content.entries)}, got {number}")
-    return content, [content.entries[number - 1]]
+    if not 1 <= wanted.stack <= len(content.entries):
+        raise StackgenError(f"{file}: --stack must lie in 1..{len(content.entries)}, got {wanted.stack}")
+    return replace(content, entries=(content.entries[wanted.stack - 1],))
 
 
-def _from_image(
-    image: Path, file: Path | None, inventory: str | None, weights: str, budget: str | None, seed: int
-) -> tuple[StacksFile, list[Entry]]:
-    """Silhouette, block list and stacks that a simulator judged; those that stand, the best first.
-
-    Raises:
-        StackgenError: If nothing that stands was found.
-    """
+def _from_image(image: Path, file: Path | None, wanted: Wanted) -> StacksFile:
+    """Sample stacks for a picture; those that stand, the best first."""
     if file is not None:
         raise StackgenError(f"give {file} or --from_image {image}, not both")
     from stackgen.api import load
-    from stackgen.sampling.verified import Budget
+    from stackgen.robot.candidates import NUMBER, stacks_of_picture
 
-    model = load(weights)
-    seen = _seen(image, model.grid)
-    spent = None if budget is None else Budget.parse(budget)
-    number = 3
-    with progress_bar("stacks", number + 1) as (advance, _):
-        done = iter(range(1, number + 2))
-        found = model.sample_verified(
-            seen, number, seed, inventory=inventory, budget=spent, on_step=lambda: advance(next(done))
+    with progress_bar("stacks", NUMBER + 1) as (advance, _):
+        done = iter(range(1, NUMBER + 2))
+        found = stacks_of_picture(
+            image,
+            load(wanted.weights),
+            inventory=wanted.inventory,
+            budget=wanted.budget,
+            seed=wanted.seed,
+            on_step=lambda: advance(next(done)),
         )
-    found = replace(found, silhouette=image.name)
-    standing = [entry for entry in found.entries if entry.verdict is not None and entry.verdict.stable]
-    if not standing:
-        raise StackgenError(f"{image}: none of the stacks that were tried stands; try a larger --budget")
     assert found.block_list is not None
-    blocks = format_block_list(found.block_list, found.catalogue)
-    Console().print(f"{image.name}: {blocks}; {found.comment}; front IoU {standing[0].front_iou:.2f}", highlight=False)
-    return found, standing
+    blocks, best = format_block_list(found.block_list, found.world.catalogue), found.entries[0].front_iou
+    Console().print(f"{image.name}: {blocks}; {found.comment}; front IoU {best:.2f}", highlight=False)
+    return found
 
 
-_SAME = 0.7
-"""Front IoU from which on the two ways to read a picture are taken to have seen the same."""
-
-
-def _seen(image: Path, grid: Grid) -> Mask:
-    """The silhouette in a drawing, in the photo of one, or in a depth frame.
-
-    A clean picture is read by its colours; that fails, or sees something else, where light is uneven or only the
-    outline is drawn: then it is a sketch.
-    """
-    from stackgen.vision.depth import capture, is_depth, read_frame
-    from stackgen.vision.drawings import read_silhouette
-    from stackgen.vision.sketches import read_sketch
-
-    if is_depth(image):
-        return capture(read_frame(image), grid).silhouette
-    try:
-        sketch = read_sketch(image, grid).silhouette
-    except StackgenError:
-        return read_silhouette(image, grid)
-    try:
-        drawing = read_silhouette(image, grid)
-    except StackgenError:
-        return sketch
-    return drawing if iou(drawing, sketch) >= _SAME else sketch
-
-
-def _physics(content: StacksFile) -> Physics:
-    from stackgen.sim.physics import Physics
-
-    return replace(Physics.of_world(content.physics), cell_size=content.cell_size)
-
-
-def _planned(
-    entries: Sequence[Entry], cell: Cell, physics: Physics, order: Strategy, solver: SolverName, placed: int
-) -> tuple[Design, BuildPlan]:
-    """All that can be found out before anything moves, of the first stack that can be built.
-
-    Raises:
-        StackgenError: If none can; it says why of the first.
-    """
-    from stackgen.robot.build import design
-    from stackgen.robot.planning.plan import plan_build
-
-    reasons = []
-    for entry in entries:
-        try:
-            wanted = design(entry.stack, cell, physics, order)
-            with progress_bar("plan", len(wanted.stack)) as (advance, say):
-                if not wanted.order.safe:
-                    say(f"the greedy order is not safe: {wanted.order.blocked}")
-                return wanted, plan_build(wanted.stack, wanted.order.blocks, cell, physics, solver, advance, placed)
-        except StackgenError as error:
-            reasons.append(error)
-    raise reasons[0]
-
-
-def _built(
-    wanted: Design,
-    plan: BuildPlan,
-    cell: Cell,
-    physics: Physics,
-    grasp: Grasp,
-    noise: tuple[float, float, int],
-    content: StacksFile,
-    gui: bool,
-    picture: Path,
-    video: Path | None,
-) -> BuildReport:
+def _built(planned: PlannedBuild, wanted: Wanted, simulation: Simulation, content: StacksFile) -> BuildReport:
     from stackgen.robot.build import build
     from stackgen.robot.simulated.arm import PickNoise
     from stackgen.robot.simulated.film import Film
 
-    with progress_bar("build", len(wanted.stack)) as (advance, _):
+    with progress_bar("build", len(planned.plan.stack)) as (advance, _):
         return build(
-            wanted,
-            plan,
-            cell,
-            physics,
-            grasp,
-            PickNoise(*noise),
-            gui,
-            content.target,
-            content.grid,
-            advance,
-            Film(picture, video).camera,
+            planned,
+            content.world.grid,
+            target=content.target,
+            grasp=simulation.grasp,
+            noise=PickNoise(simulation.noise_mm / 1e3, math.radians(simulation.noise_deg), wanted.seed),
+            window=simulation.gui,
+            on_block=advance,
+            camera=Film(wanted.out / "build.png", simulation.video).camera,
         )
 
 
 def _write(
-    out: Path,
-    result: BuildReport,
-    content: StacksFile,
-    cell: Cell,
-    physics: Physics,
-    noise: tuple[float, float, int],
+    wanted: Wanted, simulation: Simulation, planned: PlannedBuild, content: StacksFile, result: BuildReport
 ) -> None:
-    """build.json and stacks.json."""
+    """Write build.json and stacks.json."""
+    physics = planned.physics.to_json()
     plain = {
         **result.to_json(),
-        "noise": {"mm": noise[0] * 1e3, "deg": float(np.degrees(noise[1])), "seed": noise[2]},
-        "physics": physics.to_json(),
-        "cell": cell.to_json(),
+        "noise": {"mm": simulation.noise_mm, "deg": simulation.noise_deg, "seed": wanted.seed},
+        "physics": physics,
+        "cell": planned.workcell.to_json(),
     }
-    write_atomically(out / "build.json", (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode())
-    entry = Entry(result.stack, comment="as the robot built it")
-    write_stacks(out / "stacks.json", replace(content, entries=(entry,), physics=physics.to_json()))
+    write_json(wanted.out / "build.json", plain)
+    entry = StackEntry(result.stack, comment="as the robot built it")
+    write_stacks(wanted.out / "stacks.json", replace(content, entries=(entry,), physics=physics))
 
 
 def _show(result: BuildReport) -> None:
-    """A row for each block, and what stands in the end."""
+    """Print a row for each block, and what stands in the end."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # 80 columns hold it
     table.add_column("block", no_wrap=True)
     headings = ("released\nxy mm", "settled\nxy mm", "z\nmm", "yaw\n°", "disturbed\nmm", "clearance\nmm", "time\ns")
@@ -323,13 +264,14 @@ COMMAND = Command(
     stackgen build examples/stacks/arch.json --arm ur-rtde --host 192.168.0.10 --execute
     """,
     files=Files("file", "FILE", "A stacks.json.", optional=True),
-    settings=("real", RealArm),
+    settings={"wanted": Wanted, "simulation": Simulation, "real": RealArm},
     flags={
         "gui": "Show the build in a window, where there is a display.",
-        "execute": "Have the real arm move; without it everything but that is done.",
+        "execute": "Have the real arm move; without it everything else is done.",
         "yes": "Do not ask before the real arm moves.",
-        "resume": "Go on with the next block of a real build that was interrupted.",
+        "resume": "Continue a real build that was interrupted with its next block.",
     },
+    hidden=("cell", "controller", "gripper"),
 )
 
 

@@ -32,6 +32,7 @@ register_type(Catalogue, Catalogue.to_json, _catalogue)
 set_parsing_settings(subclasses_enabled=[Catalogue])
 
 CONFIG_FLAGS = ("-c", "--config")
+HELP_OF_ALL = "--help=all"
 CONFIG_HELP = "YAML file with these options, or with a section named like the verb that holds them."
 
 
@@ -75,18 +76,23 @@ class Command:
         function: What it does; answers the exit code, or None for 0.
         example: Command lines to show under the help.
         files: The paths it takes, if any.
-        settings: A parameter that is a dataclass whose fields are options of their own, without a prefix.
+        settings: Parameters that are dataclasses, with their types; their fields are options of their own, without a
+            prefix.
         flags: Boolean parameters that are switched on by naming them, and their help.
+        hidden: Options whose parts (`cell` for `--cell.*`) only `--help=all` shows.
         interpolation: Whether `${...}` in configuration files stands for another option's value.
+        config: Parameter that takes the text of all options as YAML, to be kept with what the verb makes.
     """
 
     verb: str
     function: Callable[..., int | None]
     example: str
     files: Files | None = None
-    settings: tuple[str, type] | None = None
+    settings: Mapping[str, type] = field(default_factory=dict)
     flags: Mapping[str, str] = field(default_factory=dict)
+    hidden: tuple[str, ...] = ()
     interpolation: bool = True
+    config: str | None = None
 
     def parser(self) -> ArgumentParser:
         """The parser; it raises its errors instead of printing them."""
@@ -112,15 +118,13 @@ class Command:
                 help=self.files.help,
                 **no_default,
             )
-        if self.settings:
-            parser.add_class_arguments(self.settings[1], sub_configs=True, as_group=False)
+        for kind in self.settings.values():
+            parser.add_class_arguments(kind, skip=set(self.flags), sub_configs=True, as_group=False)
         for name, text in self.flags.items():
             parser.add_argument(f"--{name}", action="store_true", help=text)
-        special: set[str | int] = set(self.flags)
+        special: set[str | int] = {*self.flags, *self.settings, *((self.config,) if self.config else ())}
         if self.files:
             special.add(self.files.parameter)
-        if self.settings:
-            special.add(self.settings[0])
         parser.add_function_arguments(
             self.function, skip=special, as_group=False, as_positional=False, sub_configs=True
         )
@@ -129,13 +133,34 @@ class Command:
     def run(self, argv: Sequence[str]) -> int | None:
         """Parse what follows the verb and call the function."""
         parser = self.parser()
+        if HELP_OF_ALL in argv:
+            parser.print_help()
+            return 0
+        if {"-h", "--help"} & set(argv):
+            self._shorten_help(parser)
         values = parse(parser, self.verb, own_sections(self.verb, argv))
         values.pop("config", None)
+        text = parser.dump(values, skip_none=False) if self.config else ""
         options = vars(parser.instantiate(values))
-        if self.settings:
-            name, kind = self.settings
+        if self.config:
+            options[self.config] = text
+        for name, kind in self.settings.items():
             options[name] = kind(**{item.name: options.pop(item.name) for item in fields(kind)})
         return self.function(**options)
+
+    def _shorten_help(self, parser: ArgumentParser) -> None:
+        """Leave the hidden options out of a parser's help, and say where they are."""
+        shown = [action for action in parser._actions if action.help != argparse.SUPPRESS]
+        hidden = [action for action in shown if action.dest.partition(".")[0] in self.hidden]
+        for action in hidden:
+            action.help = argparse.SUPPRESS
+        for group in parser._action_groups:
+            if all(action.help == argparse.SUPPRESS for action in group._group_actions):
+                group.title = group.description = None
+        if hidden:
+            names = ", ".join(f"--{name}.*" for name in self.hidden)
+            more = f"`{parser.prog} {HELP_OF_ALL}` shows {len(hidden)} more options: {names}"
+            parser.epilog = f"{parser.epilog}\n\n{more}"
 
 
 def epilog(example: str) -> str:
@@ -200,7 +225,7 @@ def _own_text(file: Path, verb: str) -> str | None:
     try:
         written = file.read_text() if file.is_file() else ""
         content = yaml.safe_load(text := renew(written))
-    except (yaml.YAMLError, UnicodeDecodeError):
+    except (OSError, yaml.YAMLError, UnicodeDecodeError):  # text instead of a file may be too long for a path
         return None  # the parser will say so
     if isinstance(content, dict) and isinstance(content.get(verb), dict):
         return yaml.safe_dump(content[verb], sort_keys=False)

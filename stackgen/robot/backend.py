@@ -1,14 +1,17 @@
-"""What a build asks of an arm, simulated or real, and the steps that it is made of."""
+"""What a build asks of an arm, simulated or real, and how an arm carries out a plan."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.robot.planning.motion import Motion
+from stackgen.errors import StackgenError
+from stackgen.robot.planning.motion import Action, Motion, Open
+from stackgen.robot.planning.plan import BlockPlan, BuildPlan
 
 Floats = NDArray[np.float64]
 
@@ -18,8 +21,8 @@ class ArmState:
     """What an arm says of itself.
 
     Args:
-        joints: (6,) angles [rad].
-        opening: Between the pads [m].
+        joints: (n,) joint angles [rad].
+        opening: Distance between the pads [m].
         stopped: Why it does not move on (a protective stop, a lost connection); None while all is well.
     """
 
@@ -44,7 +47,7 @@ class ArmBackend(Protocol):
         ...
 
     def state(self) -> ArmState:
-        """Where it stands."""
+        """Tell where it stands."""
         ...
 
     def stop(self) -> None:
@@ -52,34 +55,46 @@ class ArmBackend(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class Open:
-    """Open the jaws.
+def _ignore(step: BlockPlan) -> None:
+    """Do nothing about a block."""
+
+
+def execute(
+    plan: BuildPlan,
+    arm: ArmBackend,
+    *,
+    on_start: Callable[[BlockPlan], None] = _ignore,
+    on_release: Callable[[BlockPlan], None] = _ignore,
+    on_done: Callable[[BlockPlan], None] = _ignore,
+    first: int = 0,
+) -> None:
+    """Have an arm carry out a plan.
 
     Args:
-        width: Between the pads [m].
+        plan: Plan from :func:`stackgen.robot.planning.plan.plan_build`.
+        arm: Arm at the place where the first motion starts.
+        on_start, on_release, on_done: Called before each block, when the jaws have let it go, and after it.
+        first: Number of the step to begin with.
+
+    Raises:
+        StackgenError: If the arm stops on its own.
     """
-
-    width: float
-
-
-@dataclass(frozen=True)
-class Close:
-    """Close the jaws.
-
-    Args:
-        force: [N].
-    """
-
-    force: float
-
-
-Action = Motion | Open | Close
-"""One thing an arm does."""
+    for step in plan.blocks[first:]:
+        on_start(step)
+        last_open = max(i for i, action in enumerate(step.actions) if isinstance(action, Open))
+        for number, action in enumerate(step.actions):
+            _perform(action, arm)
+            stopped = arm.state().stopped
+            if stopped is not None:
+                raise StackgenError(f"the arm stopped at block {step.block}: {stopped}")
+            if number == last_open:
+                on_release(step)
+        on_done(step)
+    if plan.homing is not None:
+        arm.move(plan.homing)
 
 
-def perform(action: Action, arm: ArmBackend) -> None:
-    """Have an arm do it."""
+def _perform(action: Action, arm: ArmBackend) -> None:
     if isinstance(action, Motion):
         arm.move(action)
     elif isinstance(action, Open):

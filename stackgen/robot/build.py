@@ -1,7 +1,8 @@
 """Build a stack: what is to stand, in which order, by which motions, and what became of it.
 
 The path of a build: the generated stack is settled, as its verdict saw it, and blocks side by side are moved apart a
-little (`design`); an order is found; all motions are planned; only then does anything move.
+little (:func:`design`); an order is found; all motions are planned (:func:`plan_stack`); only then does anything move
+(:func:`build`).
 """
 
 from __future__ import annotations
@@ -12,25 +13,30 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.geometry import iou, silhouette, silhouette_iou
 from stackgen.protocols import Verdict
-from stackgen.robot.backend import ArmBackend, Open, perform
-from stackgen.robot.planning.order import BuildOrder, Strategy, TopDownJaws, plan_order
-from stackgen.robot.planning.plan import BlockPlan, BuildPlan
+from stackgen.robot.backend import execute
+from stackgen.robot.build_report import BlockReport, BuildReport, PlacementError
+from stackgen.robot.planning.build_order import BuildOrder, Strategy, TopDownJaws, plan_order
+from stackgen.robot.planning.kinematics import SolverName
+from stackgen.robot.planning.plan import BlockPlan, BuildPlan, plan_build
 from stackgen.robot.planning.staging import make_room
-from stackgen.robot.report import BlockReport, BuildReport, PlacementError
 from stackgen.robot.simulated.arm import PickNoise, SimulatedArm
 from stackgen.robot.simulated.window import Window
-from stackgen.robot.workcell import Cell, Grasp
+from stackgen.robot.workcell import Grasp, Workcell
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
-from stackgen.world import PAPER_GRID, Grid, Mask
+from stackgen.world import Grid, Mask
 
 _LOOK_EVERY = 8  # steps between looks for contacts
 _REST = 1.0  # after the last block [s]
+
+Camera = Callable[[SimulatedArm], Callable[[bool], None]]
+"""Makes, for an arm, what is called after every step (False) and once at the end (True)."""
 
 
 @dataclass(frozen=True)
@@ -38,10 +44,10 @@ class Design:
     """What is to be built.
 
     Args:
-        stack: The blocks where they are to be.
-        generated: As generated, settled.
-        order: In which they are placed.
-        strategy: That found it.
+        stack: Blocks where they are to be.
+        generated: Stack as it was generated, settled.
+        order: Order in which the blocks are placed.
+        strategy: Strategy that found the order.
     """
 
     stack: Stack
@@ -50,61 +56,171 @@ class Design:
     strategy: Strategy
 
 
-def design(generated: Stack, cell: Cell, physics: Physics, strategy: Strategy = "safest") -> Design:
+@dataclass(frozen=True)
+class PlannedBuild:
+    """A build of which everything is known but how it ends.
+
+    Args:
+        design: What is built.
+        plan: Motions that build it.
+        workcell: Workcell of the plan.
+        physics: Physics of the blocks.
+    """
+
+    design: Design
+    plan: BuildPlan
+    workcell: Workcell
+    physics: Physics
+
+
+def design(generated: Stack, workcell: Workcell, physics: Physics, strategy: Strategy = "safest") -> Design:
     """Settle a stack, make room between its blocks, and find an order.
 
     Raises:
         StackgenError: If the stack does not stand, or there is no safe order and the greedy one was not asked for.
     """
-    checker = SimulatorChecker(physics, generated.catalogue)
-    try:
-        verdict = checker.check(generated)
-        if not verdict.stable:
-            fallen = ", ".join(f"{i} ({generated.names[i]})" for i in np.flatnonzero(verdict.fell))
-            raise StackgenError(f"the stack does not stand, so it is not built: block {fallen} would fall")
-        roomy = make_room(verdict.settled, cell.workspace.gap / physics.cell_size)
-        stack = roomy if checker.check(roomy).stable else verdict.settled
-    finally:
-        checker.simulator.close()
-    jaws = TopDownJaws(cell.jaws, physics.cell_size, cell.workspace.clearance)
+    verdict = _verdict(generated, physics)
+    if not verdict.stable:
+        fallen = ", ".join(f"{i} ({generated.names[i]})" for i in np.flatnonzero(verdict.fell))
+        raise StackgenError(f"the stack does not stand, so it is not built: block {fallen} would fall")
+    roomy = make_room(verdict.settled, workcell.workspace.gap / physics.cell_size)
+    stack = roomy if _verdict(roomy, physics).stable else verdict.settled
+    jaws = TopDownJaws(workcell.jaws, physics.cell_size, workcell.workspace.clearance)
     order = plan_order(stack, approach=jaws, strategy=strategy)
     if not order.safe and strategy != "greedy":
         raise StackgenError(f"no order is safe: {order.blocked}; --order greedy builds it in the paper's order")
     return Design(stack, verdict.settled, order, strategy)
 
 
-def execute(
-    plan: BuildPlan,
-    arm: ArmBackend,
-    on_start: Callable[[BlockPlan], None] = lambda block: None,
-    on_release: Callable[[BlockPlan], None] = lambda block: None,
-    on_done: Callable[[BlockPlan], None] = lambda block: None,
-    first: int = 0,
-) -> None:
-    """Have an arm carry out a plan.
+def plan_stack(
+    generated: Stack,
+    workcell: Workcell,
+    physics: Physics,
+    *,
+    strategy: Strategy = "safest",
+    solver: SolverName = "urdf",
+    placed: int = 0,
+    on_block: Callable[[int], None] = lambda done: None,
+) -> PlannedBuild:
+    """Find out all that can be known before anything moves.
 
     Args:
-        plan: From :func:`plan_build`.
-        arm: At the place where the first motion starts.
-        on_start, on_release, on_done: Called before each block, when the jaws have let it go, and after it.
-        first: The step to begin with.
+        generated: Stack to build.
+        workcell: Workcell to build it in.
+        physics: Physics of the blocks.
+        strategy: Strategy of the order.
+        solver: Solver of the inverse kinematics.
+        placed: Number of blocks that stand already.
+        on_block: Called with the number of blocks that stand or are planned.
 
     Raises:
-        StackgenError: If the arm stops on its own.
+        StackgenError: If the stack cannot be built.
     """
-    for step in plan.blocks[first:]:
-        on_start(step)
-        last_open = max(i for i, action in enumerate(step.actions) if isinstance(action, Open))
-        for number, action in enumerate(step.actions):
-            perform(action, arm)
-            stopped = arm.state().stopped
-            if stopped is not None:
-                raise StackgenError(f"the arm stopped at block {step.block}: {stopped}")
-            if number == last_open:
-                on_release(step)
-        on_done(step)
-    if plan.homing is not None:
-        arm.move(plan.homing)
+    wanted = design(generated, workcell, physics, strategy)
+    plan = plan_build(
+        wanted.stack, wanted.order.blocks, workcell, physics, solver=solver, on_block=on_block, placed=placed
+    )
+    return PlannedBuild(wanted, plan, workcell, physics)
+
+
+def build(
+    planned: PlannedBuild,
+    grid: Grid,
+    *,
+    target: Mask | None = None,
+    grasp: Grasp = "jaws",
+    noise: PickNoise = PickNoise(),  # noqa: B008 - frozen
+    window: bool = False,
+    on_block: Callable[[int], None] = lambda done: None,
+    camera: Camera = lambda arm: lambda end: None,
+) -> BuildReport:
+    """Carry out a plan on the simulated arm, and see what stands.
+
+    Args:
+        planned: Build from :func:`plan_stack`.
+        grid: Grid of the silhouettes.
+        target: (H, W) front silhouette to compare with.
+        grasp: How blocks are held: by friction, or by a fixed constraint.
+        noise: Distance of the blocks from where the robot believes them to be.
+        window: Whether to show it while it happens.
+        on_block: Called with the number of blocks that are placed.
+        camera: Camera that films it.
+    """
+    outcome = _simulate(planned, grasp, noise, window, on_block, camera)
+    order, physics, built = planned.design.order, planned.physics, outcome.stack
+    moved = np.linalg.norm(built.poses[:, :3] - planned.plan.stack.poses[:, :3], axis=1)
+    verdict, generated = _verdict(built, physics), planned.design.generated  # awake, in a fresh world
+    return BuildReport(
+        blocks=outcome.blocks,
+        order=planned.design.strategy,
+        safe=order.safe,
+        least_margin=order.least_margin,
+        grasp=grasp,
+        built=bool((moved < physics.fall_height).all()),
+        stands=verdict.stable,
+        iou_target=None if target is None else silhouette_iou(verdict.settled, target, grid) * verdict.stable,
+        iou_generated=iou(silhouette(verdict.settled, grid), silhouette(generated, grid)),
+        generated_iou_target=None if target is None else silhouette_iou(generated, target, grid),
+        seconds=outcome.seconds,
+        real_time_factor=outcome.seconds / outcome.wall_seconds,
+        tracking_error=outcome.tracking_error,
+        torque=outcome.torque,
+        stack=built,
+        design=planned.plan.stack,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Outcome:
+    """What the simulation of a build left: the fields of the report that are read from it."""
+
+    stack: Stack
+    blocks: tuple[BlockReport, ...]
+    seconds: float
+    wall_seconds: float
+    tracking_error: float
+    torque: tuple[float, ...]
+
+
+def _simulate(
+    planned: PlannedBuild,
+    grasp: Grasp,
+    noise: PickNoise,
+    window: bool,
+    on_block: Callable[[int], None],
+    camera: Camera,
+) -> _Outcome:
+    """Carry out a plan on the simulated arm and wait until all is at rest."""
+    plan, begin = planned.plan, time.perf_counter()
+    frames = {step.block: step.waiting.frame for step in plan.blocks}
+    believed = [frames[block] for block in range(len(plan.stack))]
+    with ExitStack() as opened:
+        arm = opened.enter_context(
+            SimulatedArm(planned.workcell, plan.stack, noise.disturb(believed), planned.physics, grasp=grasp)
+        )
+        view = opened.enter_context(Window(arm)).step if window else lambda: None
+        slots = [PlacementError.between(arm.frame(block), believed[block]) for block in range(len(plan.stack))]
+        film, watch = camera(arm), _Watch(arm, on_block)
+
+        def on_step() -> None:
+            watch.step()
+            film(False)
+            view()
+
+        arm.on_step = on_step
+        execute(plan, arm, on_start=watch.start, on_release=watch.release, on_done=watch.done)
+        arm.wait(_REST)
+        watch.end()
+        seconds, wall = arm.time, time.perf_counter() - begin
+        film(True)
+        return _Outcome(
+            stack=arm.built(),
+            blocks=tuple(watch.report(step, slots[step.block]) for step in plan.blocks),
+            seconds=seconds,
+            wall_seconds=wall,
+            tracking_error=float(np.degrees(arm.tracking_error)),
+            torque=tuple(np.round(arm.torque, 1).tolist()),
+        )
 
 
 @dataclass
@@ -112,9 +228,10 @@ class _Watch:
     """Sees a simulated build from the outside."""
 
     arm: SimulatedArm
+    on_block: Callable[[int], None]
     handled: BlockPlan | None = None
     released: dict[int, PlacementError] = field(default_factory=dict)
-    rested: dict[int, np.ndarray] = field(default_factory=dict)
+    rested: dict[int, NDArray[np.float64]] = field(default_factory=dict)
     disturbed: dict[int, float] = field(default_factory=dict)
     seconds: dict[int, float] = field(default_factory=dict)
     unplanned: dict[int, set[str]] = field(default_factory=dict)
@@ -136,21 +253,22 @@ class _Watch:
         self.unplanned.setdefault(block, set()).add(what)
 
     def start(self, step: BlockPlan) -> None:
-        """A block is begun."""
+        """Note that a block is begun."""
         self.handled, self.began = step, self.arm.time
 
     def release(self, step: BlockPlan) -> None:
-        """The jaws have let go."""
+        """Measure a block that the jaws have let go."""
         self.released[step.block] = PlacementError.between(self.arm.frame(step.block), step.goal)
 
     def done(self, step: BlockPlan) -> None:
-        """The arm has left a block."""
+        """Note that the arm has left a block."""
         self.seconds[step.block] = self.arm.time - self.began
         self._look_at_placed()
         self.rested[step.block] = self.arm.frame(step.block)[:3, 3]
+        self.on_block(len(self.rested))
 
     def end(self) -> None:
-        """All is done."""
+        """Note that all is done."""
         self.handled = None
         self._look_at_placed()
 
@@ -159,125 +277,28 @@ class _Watch:
             moved = float(np.linalg.norm(self.arm.frame(block)[:3, 3] - where)) * 1e3
             self.disturbed[block] = max(self.disturbed.get(block, 0.0), moved)
 
-
-def build(
-    wanted: Design,
-    plan: BuildPlan,
-    cell: Cell,
-    physics: Physics,
-    grasp: Grasp = "jaws",
-    noise: PickNoise = PickNoise(),  # noqa: B008 - frozen
-    window: bool = False,
-    target: Mask | None = None,
-    grid: Grid = PAPER_GRID,
-    on_block: Callable[[int], None] = lambda done: None,
-    camera: Callable[[SimulatedArm], Callable[[bool], None]] | None = None,
-) -> BuildReport:
-    """Carry out a plan on the simulated arm, and see what stands.
-
-    Args:
-        wanted: What is built.
-        plan: Its motions.
-        cell, physics: Those of the plan.
-        grasp: By friction, or by a fixed constraint.
-        noise: How far the blocks lie from where the robot believes.
-        window: Show it while it happens.
-        target: (H, W) front silhouette to compare with.
-        grid: Of the target.
-        on_block: Told how many blocks are placed.
-        camera: Makes, for the arm, what is called after every step (False) and once at the end (True).
-    """
-    frames = {step.block: step.waiting.frame for step in plan.blocks}
-    believed = [frames[block] for block in range(len(plan.stack))]
-    begin = time.perf_counter()
-    with ExitStack() as opened:
-        arm = opened.enter_context(SimulatedArm(cell, plan.stack, noise.disturb(believed), physics, grasp))
-        view = opened.enter_context(Window(arm)).step if window else lambda: None
-        slots = [PlacementError.between(arm.frame(block), believed[block]) for block in range(len(plan.stack))]
-        film = camera(arm) if camera else lambda end: None
-        watch = _watched(plan, arm, on_block, film, view)
-        seconds, wall = arm.time, time.perf_counter() - begin
-        film(True)
-        built = arm.built()
-        goals = {step.block: PlacementError.between(arm.frame(step.block), step.goal) for step in plan.blocks}
-        tracking, torque = float(np.degrees(arm.tracking_error)), tuple(np.round(arm.torque, 1).tolist())
-    blocks = tuple(_block_report(step, plan.stack, watch, slots, goals) for step in plan.blocks)
-    moved = np.linalg.norm(built.poses[:, :3] - plan.stack.poses[:, :3], axis=1)
-    verdict = _fresh_verdict(built, physics)
-    front = silhouette(verdict.settled, grid=grid)
-    return BuildReport(
-        blocks,
-        wanted.strategy,
-        wanted.order.safe,
-        wanted.order.least_margin,
-        grasp,
-        bool((moved < physics.fall_height).all()),
-        verdict.stable,
-        None if target is None else silhouette_iou(verdict.settled, target, grid=grid) * verdict.stable,
-        iou(front, silhouette(wanted.generated, grid=grid)),
-        None if target is None else silhouette_iou(wanted.generated, target, grid=grid),
-        seconds,
-        seconds / wall,
-        tracking,
-        torque,
-        built,
-        plan.stack,
-    )
+    def report(self, step: BlockPlan, slot_error: PlacementError) -> BlockReport:
+        """Report on a block, where it is now."""
+        block = step.block
+        return BlockReport(
+            block=block,
+            shape=self.arm.stack.names[block],
+            slot_error=slot_error,
+            released=self.released[block],
+            settled=PlacementError.between(self.arm.frame(block), step.goal),
+            disturbed=self.disturbed.get(block, 0.0),
+            clearance=step.clearance.distance * 1e3,
+            nearest=step.clearance.between,
+            ik_distance=step.distance * 1e3,
+            ik_turn=float(np.degrees(step.turn)),
+            seconds=self.seconds[block],
+            unplanned=tuple(sorted(self.unplanned.get(block, ()))),
+        )
 
 
-def _watched(
-    plan: BuildPlan,
-    arm: SimulatedArm,
-    on_block: Callable[[int], None],
-    film: Callable[[bool], None],
-    view: Callable[[], None],
-) -> _Watch:
-    """Carry out a plan and wait until all is at rest; what was seen."""
-    watch = _Watch(arm)
-
-    def on_step() -> None:
-        watch.step()
-        film(False)
-        view()
-
-    def on_done(step: BlockPlan) -> None:
-        watch.done(step)
-        on_block(len(watch.rested))
-
-    arm.on_step = on_step
-    execute(plan, arm, watch.start, watch.release, on_done)
-    arm.wait(_REST)
-    watch.end()
-    return watch
-
-
-def _block_report(
-    step: BlockPlan,
-    stack: Stack,
-    watch: _Watch,
-    slots: list[PlacementError],
-    settled: dict[int, PlacementError],
-) -> BlockReport:
-    block = step.block
-    return BlockReport(
-        block,
-        stack.names[block],
-        slots[block],
-        watch.released[block],
-        settled[block],
-        watch.disturbed.get(block, 0.0),
-        step.clearance.distance * 1e3,
-        step.clearance.between,
-        step.distance * 1e3,
-        float(np.degrees(step.turn)),
-        watch.seconds[block],
-        tuple(sorted(watch.unplanned.get(block, ()))),
-    )
-
-
-def _fresh_verdict(stack: Stack, physics: Physics) -> Verdict:
-    """Of a stack put down awake in a world of its own."""
-    checker = SimulatorChecker(physics, stack.catalogue)
+def _verdict(stack: Stack, physics: Physics) -> Verdict:
+    """Check a stack that is put down awake in a world of its own."""
+    checker = SimulatorChecker(physics)
     try:
         return checker.check(stack)
     finally:

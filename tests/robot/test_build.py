@@ -10,14 +10,16 @@ import pytest
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.robot.backend import ArmState, Close, Open
-from stackgen.robot.build import build, design, execute
-from stackgen.robot.planning.motion import Motion
+from stackgen.robot.backend import ArmState, execute
+from stackgen.robot.build import build, design, plan_stack
+from stackgen.robot.planning.arm_model import arm_model
+from stackgen.robot.planning.motion import Close, Motion, Open
 from stackgen.robot.planning.plan import BuildPlan, plan_build
 from stackgen.robot.simulated.arm import PickNoise
-from stackgen.robot.workcell import Base, Cell, Staging, Workspace
+from stackgen.robot.workcell import Base, Staging, Workcell, Workspace
 from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
+from stackgen.world import PAPER_GRID
 
 
 def stack_of(shapes: Sequence[int], poses: Sequence[Sequence[float]]) -> Stack:
@@ -25,8 +27,8 @@ def stack_of(shapes: Sequence[int], poses: Sequence[Sequence[float]]) -> Stack:
 
 
 PHYSICS = Physics()
-CELL = Cell()
-PLAIN = Cell(staging=replace(Staging(), straighten=False))
+WORKCELL = Workcell()
+PLAIN = Workcell(staging=replace(Staging(), straighten=False))
 CUBE = stack_of([0], [[0.2, 0, 0.5, 0, 0, 0.1]])
 GATE = stack_of([0, 0, 1], [[-0.5, 0, 0.5, 0, 0, 0], [0.5, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]])
 
@@ -34,8 +36,7 @@ GATE = stack_of([0, 0, 1], [[-0.5, 0, 0.5, 0, 0, 0], [0.5, 0, 0.5, 0, 0, 0], [0,
 @pytest.fixture(scope="module")
 def gate() -> BuildPlan:
     """Two cubes that touch, and a rectangle on them."""
-    wanted = design(GATE, PLAIN, PHYSICS)
-    return plan_build(wanted.stack, wanted.order.blocks, PLAIN, PHYSICS, "closed-form")
+    return plan_stack(GATE, PLAIN, PHYSICS, solver="closed-form").plan
 
 
 def motions(plan: BuildPlan) -> list[Motion]:
@@ -64,31 +65,30 @@ def test_cubes_that_touched_have_room_and_the_arm_keeps_clear(gate: BuildPlan) -
 
 
 def test_the_tip_ends_where_the_block_is_to_be(gate: BuildPlan) -> None:
-    from stackgen.robot.planning.urdf import ur5_chain
-
     for step in gate.blocks:
         placed = [action for action in step.actions if isinstance(action, Motion) and action.name == "lower"][-1]
-        tip = PLAIN.tip_in_table(ur5_chain().forward(placed.end))
+        tip = PLAIN.tip_in_table(arm_model(PLAIN.arm).forward(placed.end))
         frame = tip @ np.linalg.inv(step.waiting.grasp) @ step.waiting.frame
         assert np.allclose(frame[:3, 3] - step.goal[:3, 3], [0, 0, PLAIN.workspace.drop], atol=1e-5)
 
 
 def test_straightening_pushes_from_both_ends() -> None:
-    plan = plan_build(CUBE, [0], CELL, PHYSICS, "closed-form")
+    plan = plan_build(CUBE, [0], WORKCELL, PHYSICS, solver="closed-form")
     names = [action.name for action in motions(plan)]
     assert names.count("straighten") == 9 and names.index("straighten") < names.index("approach")
 
 
 @pytest.mark.parametrize(
-    ("cell", "message"),
+    ("workcell", "message"),
     [
-        (Cell(base=Base((0.0, 0.9, 0.0))), r"block 0 \(cube, .*\) is out of the arm's reach"),
-        (Cell(workspace=replace(Workspace(), high=(0.25, 0.4, 0.6))), r"lies outside cell\.workspace"),
+        (Workcell(base=Base((0.0, 0.9, 0.0))), r"block 0 \(cube, .*\) is out of the arm's reach"),
+        (Workcell(workspace=replace(Workspace(), high=(0.25, 0.4, 0.6))), r"lies outside cell\.workspace"),
     ],
 )
-def test_what_is_out_of_reach_is_refused(cell: Cell, message: str) -> None:
+def test_what_is_out_of_reach_is_refused(workcell: Workcell, message: str) -> None:
+    cube = stack_of([0], [[0, 0, 0.5, 0, 0, 0]])
     with pytest.raises(StackgenError, match=message):
-        plan_build(stack_of([0], [[0, 0, 0.5, 0, 0, 0]]), [0], replace(cell, staging=_right()), PHYSICS, "closed-form")
+        plan_build(cube, [0], replace(workcell, staging=_right()), PHYSICS, solver="closed-form")
 
 
 def _right() -> Staging:
@@ -100,12 +100,12 @@ def test_a_block_between_two_towers_cannot_be_placed() -> None:
     xz = [(-1.05, 0.5), (-1.05, 1.5), (1.05, 0.5), (1.05, 1.5), (0, 0.5)]
     stack = stack_of([0] * 5, [[x, 0, z, 0, 0, 0] for x, z in xz])
     with pytest.raises(StackgenError, match=r"block 4 \(cube\) cannot be placed: lower would bring .* within"):
-        plan_build(stack, [0, 1, 2, 3, 4], PLAIN, PHYSICS, "closed-form")
+        plan_build(stack, [0, 1, 2, 3, 4], PLAIN, PHYSICS, solver="closed-form")
 
 
 def test_a_stack_that_falls_is_not_built() -> None:
     with pytest.raises(StackgenError, match=r"does not stand, so it is not built: block 1 \(cube\) would fall"):
-        design(stack_of([0, 0], [[0, 0, 0.5, 0, 0, 0], [0.7, 0, 1.5, 0, 0, 0]]), CELL, PHYSICS)
+        design(stack_of([0, 0], [[0, 0, 0.5, 0, 0, 0], [0.7, 0, 1.5, 0, 0, 0]]), WORKCELL, PHYSICS)
 
 
 @dataclass
@@ -165,10 +165,9 @@ def test_noise_is_the_same_for_the_same_seed() -> None:
 
 @pytest.mark.parametrize("grasp", ["jaws", "fixed"])
 def test_a_cube_that_lies_beside_its_place_is_built_to_a_fraction_of_a_millimetre(grasp: str) -> None:
-    wanted = design(CUBE, CELL, PHYSICS)
-    plan = plan_build(wanted.stack, wanted.order.blocks, CELL, PHYSICS)
+    planned = plan_stack(CUBE, WORKCELL, PHYSICS)
     noise = PickNoise(2e-3, 0.02, seed=1) if grasp == "jaws" else PickNoise()
-    report = build(wanted, plan, CELL, PHYSICS, "fixed" if grasp == "fixed" else "jaws", noise)
+    report = build(planned, PAPER_GRID, grasp="fixed" if grasp == "fixed" else "jaws", noise=noise)
     (block,) = report.blocks
     assert report.success and report.unplanned == ()
     assert (block.slot_error.xy > 1) == (grasp == "jaws")
@@ -179,9 +178,7 @@ def test_a_cube_that_lies_beside_its_place_is_built_to_a_fraction_of_a_millimetr
 
 @pytest.mark.slow
 def test_a_gate_is_built_with_noise() -> None:
-    wanted = design(GATE, CELL, PHYSICS)
-    plan = plan_build(wanted.stack, wanted.order.blocks, CELL, PHYSICS)
-    report = build(wanted, plan, CELL, PHYSICS, noise=PickNoise(1e-3, 0.017, seed=3))
+    report = build(plan_stack(GATE, WORKCELL, PHYSICS), PAPER_GRID, noise=PickNoise(1e-3, 0.017, seed=3))
     assert report.success and report.unplanned == ()
     assert np.median(report.errors("xy")) < 0.5
     assert max(block.disturbed for block in report.blocks) < 0.3

@@ -1,4 +1,4 @@
-"""How near the arm comes to anything: a copy of the cell in which nothing moves by itself.
+"""The distances of the arm from everything: a copy of the workcell in which nothing moves by itself.
 
 Arm, jaws and blocks are put where a plan has them and Bullet is asked for closest points. Lengths in metres.
 """
@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from stackgen.robot.planning.urdf import BASE, FINGER_JOINTS, FINGERS, self_collision_pairs, with_jaws
-from stackgen.robot.workcell import Cell
+from stackgen.robot.planning.urdf import FINGER_JOINTS, FINGERS, chain_links, self_collision_pairs, with_jaws
+from stackgen.robot.workcell import Workcell
 from stackgen.sim.physics import Physics
 from stackgen.sim.simulator import Mold, bullet
 from stackgen.stack import Stack
@@ -36,8 +36,8 @@ class Near:
     """The least distance found.
 
     Args:
-        distance: [m]; `SEEN` where nothing is nearer.
-        between: What, in words.
+        distance: Distance [m]; `SEEN` where nothing is nearer.
+        between: The two things, in words.
     """
 
     distance: float = SEEN
@@ -48,7 +48,7 @@ class Near:
 
 
 def block_frame(pose: Floats, cell_size: float) -> Floats:
-    """(4, 4) frame [m] of a block's pose (6,) [cell, rad]."""
+    """Frame (4, 4) [m] of a block's pose (6,) [cell, rad]."""
     frame = np.eye(4)
     frame[:3, :3] = Rotation.from_rotvec(pose[3:]).as_matrix()
     frame[:3, 3] = pose[:3] * cell_size
@@ -66,13 +66,15 @@ def body_placement(shape: Shape, frame: Floats, cell_size: float) -> tuple[list[
     return position.tolist(), Rotation.from_matrix(frame[:3, :3]).as_quat().tolist()
 
 
-def load_arm(cell: Cell, client: int, visual: bool) -> int:
-    """Load the arm with its jaws at its place; returns its body."""
+def load_arm(workcell: Workcell, client: int, visual: bool) -> int:
+    """Load the arm with its jaws at its place; return Bullet's number of its body."""
     with tempfile.TemporaryDirectory(prefix="stackgen-") as folder:
-        file = Path(folder) / "ur5_jaws.urdf"
-        file.write_text(with_jaws(cell.jaws, visual))
-        yaw = Rotation.from_matrix(cell.base.table_from_base[:3, :3]).as_quat().tolist()
-        return int(bullet.loadURDF(str(file), list(cell.base.position), yaw, useFixedBase=True, physicsClientId=client))
+        file = Path(folder) / "arm_with_jaws.urdf"
+        file.write_text(with_jaws(workcell.arm, workcell.jaws, visual))
+        yaw = Rotation.from_matrix(workcell.base.table_from_base[:3, :3]).as_quat().tolist()
+        return int(
+            bullet.loadURDF(str(file), list(workcell.base.position), yaw, useFixedBase=True, physicsClientId=client)
+        )
 
 
 @dataclass(frozen=True)
@@ -80,9 +82,9 @@ class ArmIndices:
     """Bullet's numbers of the arm's links and joints; a joint and the link after it share theirs.
 
     Args:
-        links: By name.
-        arm: The six joints.
-        fingers: The two jaws.
+        links: Number of each link, by its name.
+        arm: Numbers of the arm's joints.
+        fingers: Numbers of the two jaws.
     """
 
     links: dict[str, int]
@@ -91,32 +93,33 @@ class ArmIndices:
 
     @staticmethod
     def of(body: int, client: int) -> ArmIndices:
-        """Read them."""
+        """Read the numbers of a body."""
         numbers = range(bullet.getNumJoints(body, physicsClientId=client))
         infos = [bullet.getJointInfo(body, number, physicsClientId=client) for number in numbers]
-        links = {info[12].decode(): info[0] for info in infos} | {BASE: -1}
+        base = bullet.getBodyInfo(body, physicsClientId=client)[0].decode()
+        links = {info[12].decode(): info[0] for info in infos} | {base: -1}
         by_name = {info[1].decode(): info[0] for info in infos}
         arm = tuple(info[0] for info in infos if info[2] == bullet.JOINT_REVOLUTE)
         return ArmIndices(links, arm, tuple(by_name[name] for name in FINGER_JOINTS))
 
     def name(self, link: int) -> str:
-        """Of a link."""
+        """Name of a link."""
         return next(name for name, number in self.links.items() if number == link)
 
 
 class Clearances:
-    """Measures distances in a cell with blocks.
+    """Measures distances in a workcell with blocks.
 
     Args:
-        cell: With the arm.
-        stack: Whose blocks there are.
-        physics: Of their sizes.
+        workcell: The arm and its place.
+        stack: Stack with the blocks.
+        physics: Physics with the blocks' size.
     """
 
-    def __init__(self, cell: Cell, stack: Stack, physics: Physics) -> None:
-        self.cell, self.stack, self.physics = cell, stack, physics
+    def __init__(self, workcell: Workcell, stack: Stack, physics: Physics) -> None:
+        self.workcell, self.stack, self.physics = workcell, stack, physics
         self._client = bullet.connect(bullet.DIRECT)
-        self._arm = load_arm(cell, self._client, visual=False)
+        self._arm = load_arm(workcell, self._client, visual=False)
         self.indices = ArmIndices.of(self._arm, self._client)
         slab = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=[2, 2, 0.5], physicsClientId=self._client)
         self._table = bullet.createMultiBody(0, slab, -1, [0, 0, -0.5], physicsClientId=self._client)
@@ -128,8 +131,8 @@ class Clearances:
         for block, shape in zip(self._blocks, stack.shapes, strict=True):
             bullet.changeDynamics(block, -1, **molds[shape].dynamics, physicsClientId=self._client)
         links = self.indices.links
-        self._pairs = [(links[a], links[b]) for a, b in self_collision_pairs()]
-        self._standing = {links[BASE], links["shoulder_link"]}  # the arm's foot is at home on the table
+        self._pairs = [(links[a], links[b]) for a, b in self_collision_pairs(workcell.arm)]
+        self._standing = {links[name] for name in chain_links(workcell.arm)[:2]}  # the arm's foot is at home there
         self._fingers = {links[name] for name in FINGERS}
 
     def put_block(self, number: int, frame: Floats) -> None:
@@ -139,20 +142,20 @@ class Clearances:
         bullet.resetBasePositionAndOrientation(self._blocks[number], position, quaternion, physicsClientId=self._client)
 
     def put_arm(self, joints: Floats, opening: float) -> None:
-        """Put the arm at joint angles (6,) [rad], the jaws open by so much [m]."""
+        """Put the arm at joint angles (n,) [rad], the jaws open to a width [m]."""
         for index, angle in zip(self.indices.arm, joints.tolist(), strict=True):
             bullet.resetJointState(self._arm, index, angle, physicsClientId=self._client)
         for index in self.indices.fingers:
             bullet.resetJointState(self._arm, index, opening / 2, physicsClientId=self._client)
 
     def of_arm(self, blocks: Iterable[int], touched: int | None = None) -> Near:
-        """The arm and its jaws from the table, from itself and from some blocks.
+        """Least distance of the arm and its jaws from the table, from the arm itself and from some blocks.
 
         Finger tips go near the table on purpose; the workspace's lowest height is what keeps them off it.
 
         Args:
-            blocks: Their numbers.
-            touched: The block that the fingers may touch.
+            blocks: Numbers of the blocks.
+            touched: Number of the block that the fingers may touch.
         """
         nearest = self._to(self._table, "the table", self._standing | self._fingers)
         for number in blocks:
@@ -166,11 +169,11 @@ class Clearances:
         return nearest
 
     def of_block(self, number: int, others: Iterable[int], but: Collection[int] = ()) -> Near:
-        """A block from the table and from other blocks.
+        """Least distance of a block from the table and from other blocks.
 
         Args:
-            number: Of the block.
-            others: Blocks that there are.
+            number: Number of the block.
+            others: Numbers of the blocks that there are.
             but: Blocks, and `TABLE`, that it may touch.
         """
         nearest = Near()
@@ -184,7 +187,7 @@ class Clearances:
         return nearest
 
     def touching(self, number: int, others: Iterable[int], within: float) -> frozenset[int]:
-        """Blocks, and `TABLE`, that a block is this near to [m]."""
+        """Find the blocks, and `TABLE`, that a block is within a distance [m] of."""
         bodies = {other: self._blocks[other] for other in others if other != number} | {TABLE: self._table}
         return frozenset(
             other
@@ -200,7 +203,7 @@ class Clearances:
         )
 
     def close(self) -> None:
-        """Give the world's memory back."""
+        """Free the memory of the copy."""
         if self._client >= 0:
             bullet.disconnect(self._client)
             self._client = -1

@@ -1,4 +1,4 @@
-"""Motions of the arm: time-optimal under limits of speed, acceleration and jerk, by ruckig.
+"""Actions of the arm: opening and closing the jaws, and motions that ruckig makes as fast as their limits allow.
 
 A joint motion goes straight in joint space, a line straight in space; both start and end at rest. T samples.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
-from stackgen.errors import StackgenError
+from stackgen.errors import StackgenError, require
 from stackgen.robot.workcell import Speeds
 
 Floats = NDArray[np.float64]
@@ -25,15 +25,15 @@ RATE = 120.0
 
 @dataclass(frozen=True)
 class Motion:
-    """What the joints do over time.
+    """The joint angles over time.
 
     Args:
-        name: Its part in the work: `transit`, `approach`, `lift`, `lower`, `retreat`, `straighten`.
+        name: Part in the work: `transit`, `approach`, `lift`, `lower`, `retreat`, `straighten`.
         kind: Straight in joint space, or in space.
         times: (T,) from 0 on [s].
-        positions: (T, 6) [rad].
-        velocities: (T, 6) [rad/s].
-        speed: Of the tool on a line [m/s], of the fastest joint otherwise [rad/s]: the limit it was planned with.
+        positions: (T, n) joint angles [rad].
+        velocities: (T, n) joint speeds [rad/s].
+        speed: Limit it was planned with: of the tool on a line [m/s], of the fastest joint otherwise [rad/s].
     """
 
     name: str
@@ -45,12 +45,12 @@ class Motion:
 
     @property
     def duration(self) -> float:
-        """[s]."""
+        """Time from start to end [s]."""
         return float(self.times[-1])
 
     @property
     def end(self) -> Floats:
-        """(6,) the last joint angles [rad]."""
+        """(n,) the last joint angles [rad]."""
         return self.positions[-1]
 
     @cached_property
@@ -58,13 +58,39 @@ class Motion:
         return CubicHermiteSpline(self.times, self.positions, self.velocities)
 
     def at(self, times: ArrayLike) -> tuple[Floats, Floats]:
-        """Joint angles [rad] and speeds [rad/s] (..., 6) at any times; at rest after the end."""
+        """Joint angles [rad] and speeds [rad/s] (..., n) at any times; at rest after the end."""
         clipped = np.clip(np.asarray(times, dtype=float), 0, self.duration)
         return self._spline(clipped), self._spline(clipped, 1)
 
 
+@dataclass(frozen=True)
+class Open:
+    """Open the jaws.
+
+    Args:
+        width: Distance between the pads [m].
+    """
+
+    width: float
+
+
+@dataclass(frozen=True)
+class Close:
+    """Close the jaws.
+
+    Args:
+        force: Force with which they close [N].
+    """
+
+    force: float
+
+
+Action = Motion | Open | Close
+"""One thing an arm does."""
+
+
 def joint_motion(name: str, start: Floats, goal: Floats, speeds: Speeds) -> Motion | None:
-    """Straight in joint space, all joints starting and stopping together; None where nothing is to be done."""
+    """Move straight in joint space, all joints starting and stopping together; None where nothing is to be done."""
     if np.abs(goal - start).max() < 1e-6:
         return None
     limits = np.radians([speeds.joint, speeds.joint_acceleration, speeds.joint_jerk])
@@ -76,7 +102,7 @@ def joint_motion(name: str, start: Floats, goal: Floats, speeds: Speeds) -> Moti
 
 
 def line_motion(name: str, joints: Floats, distances: Floats, speed: float, speeds: Speeds) -> Motion:
-    """Along joint angles (n, 6) that were solved at distances (n,) on a straight line [m].
+    """Move along joint angles (m, n) that were solved at distances (m,) on a straight line [m].
 
     The tool keeps to its limits, and slows down where a joint would have to turn faster than it may.
     """
@@ -95,13 +121,12 @@ def line_motion(name: str, joints: Floats, distances: Floats, speed: float, spee
 
 
 def _profile(length: float, speed: float, acceleration: float, jerk: float) -> tuple[Floats, Floats, Floats]:
-    """Times (T,), way (T,) and rate (T,) of the fastest way over a length under limits."""
-    from ruckig import InputParameter, Result, Ruckig, Trajectory
-
-    wanted, found = InputParameter(1), Trajectory(1)
+    """Time the fastest way over a length under limits: times (T,), way (T,) and rate (T,)."""
+    ruckig = require("ruckig", "robot")
+    wanted, found = ruckig.InputParameter(1), ruckig.Trajectory(1)
     wanted.current_position, wanted.target_position = [0.0], [length]
     wanted.max_velocity, wanted.max_acceleration, wanted.max_jerk = [speed], [acceleration], [jerk]
-    if Ruckig(1).calculate(wanted, found) not in (Result.Working, Result.Finished):
+    if ruckig.Ruckig(1).calculate(wanted, found) not in (ruckig.Result.Working, ruckig.Result.Finished):
         raise StackgenError(f"no motion over {length:g} keeps to speed {speed:g}, acceleration {acceleration:g}")
     times = np.linspace(0, found.duration, max(3, int(np.ceil(found.duration * RATE)) + 1))
     samples = [found.at_time(float(time)) for time in times]

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.robot.backend import Action, Close, Open
+from stackgen.robot.planning.arm_model import arm_model
 from stackgen.robot.planning.clearance import TABLE, Clearances, Near, block_frame
 from stackgen.robot.planning.kinematics import SOLVERS, InverseKinematics, SolverName, Unreachable
-from stackgen.robot.planning.motion import Motion, joint_motion, line_motion
+from stackgen.robot.planning.motion import Action, Close, Motion, Open, joint_motion, line_motion
 from stackgen.robot.planning.staging import Waiting, lay_out, push_path
-from stackgen.robot.workcell import Cell, pose
+from stackgen.robot.workcell import Workcell, pose
 from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
 
@@ -38,13 +38,13 @@ class BlockPlan:
     """What the arm does with one block.
 
     Args:
-        block: Its number in the stack.
-        waiting: Where it is fetched.
-        goal: (4, 4) where it is to be.
+        block: Number of the block in the stack.
+        waiting: Place where it is fetched.
+        goal: (4, 4) frame where it is to be.
         touching: Blocks, and `TABLE`, that it may touch there.
-        actions: In their order.
-        clearance: The least of arm, jaws and held block from what they do not handle.
-        distance, turn: The largest residual of the joint solutions [m, rad].
+        actions: Actions in their order.
+        clearance: Least distance of arm, jaws and held block from what they do not handle.
+        distance, turn: Largest residual of the joint solutions [m, rad].
     """
 
     block: int
@@ -58,7 +58,7 @@ class BlockPlan:
 
     @property
     def duration(self) -> float:
-        """Of its motions [s]; the jaws take their own time."""
+        """Duration of its motions [s]; the jaws take their own time."""
         return sum(action.duration for action in self.actions if isinstance(action, Motion))
 
 
@@ -67,10 +67,10 @@ class BuildPlan:
     """What the arm does to build a stack.
 
     Args:
-        stack: The blocks where they are to be.
-        order: Their numbers, first to last.
-        blocks: A plan for each that does not stand already, in that order.
-        homing: The way back to the home position at the end.
+        stack: Blocks where they are to be.
+        order: Numbers of the blocks, first to last.
+        blocks: Plan for each block that does not stand already, in that order.
+        homing: Way back to the home position at the end.
     """
 
     stack: Stack
@@ -80,15 +80,16 @@ class BuildPlan:
 
     @property
     def clearance(self) -> Near:
-        """The least of all blocks'."""
+        """Least clearance of all blocks."""
         return min((block.clearance for block in self.blocks), default=Near())
 
 
 def plan_build(
     stack: Stack,
     order: ArrayLike,
-    cell: Cell,
+    workcell: Workcell,
     physics: Physics,
+    *,
     solver: SolverName = "urdf",
     on_block: Callable[[int], None] = lambda done: None,
     placed: int = 0,
@@ -97,12 +98,12 @@ def plan_build(
 
     Args:
         stack: Blocks at rest where they are to be.
-        order: (k,) in which they are placed.
-        cell: Arm, jaws and staging area.
-        physics: Of the blocks' size.
-        solver: Of the inverse kinematics.
-        on_block: Told how many blocks stand or are planned.
-        placed: How many of the order stand already; the plan is of the others, and starts at home.
+        order: (k,) numbers of the blocks in the order of placing.
+        workcell: Arm, jaws and staging area.
+        physics: Physics with the blocks' size.
+        solver: Solver of the inverse kinematics.
+        on_block: Called with the number of blocks that stand or are planned.
+        placed: Number of blocks of the order that stand already; the plan is for the others, and starts at home.
 
     Raises:
         StackgenError: If a block is too large for jaws or slots, out of reach, or cannot be placed without
@@ -110,16 +111,17 @@ def plan_build(
     """
     numbers = tuple(int(block) for block in np.asarray(order))
     size = physics.cell_size
-    waiting = lay_out(stack, numbers, cell, size)
+    waiting = lay_out(stack, numbers, workcell, size)
     goals = {block: block_frame(stack.poses[block], size) for block in numbers}
     blocks = []
-    with Clearances(cell, stack, physics) as scene:
+    with Clearances(workcell, stack, physics) as scene:
         for block in numbers:
             scene.put_block(block, goals[block])
         # Nearer than the gap that is made for those side by side is only what it stands on, with an edge perhaps.
-        near = 0.9 * cell.workspace.gap
+        near = 0.9 * workcell.workspace.gap
         touching = {block: scene.touching(block, numbers, near) for block in numbers}
-        planner = _Planner(cell, scene, SOLVERS[solver](cell.home_joints), size)
+        kinematics = SOLVERS[solver](arm_model(workcell.arm), workcell.home_joints)
+        planner = _Planner(workcell, scene, kinematics, size)
         for block in numbers[:placed]:
             planner.put_down(block, goals[block])
         for block in numbers[placed:]:
@@ -137,7 +139,7 @@ def plan_build(
             except Collision as error:
                 raise StackgenError(f"block {block} ({stack.names[block]}) cannot be placed: {error}") from error
             on_block(done + 1)
-        homing = joint_motion("home", planner.joints, cell.home_joints, cell.speeds)
+        homing = joint_motion("home", planner.joints, workcell.home_joints, workcell.speeds)
     return BuildPlan(stack, numbers, tuple(blocks), homing)
 
 
@@ -145,19 +147,19 @@ def plan_build(
 class _Planner:
     """The arm as it will stand, step by step."""
 
-    cell: Cell
+    workcell: Workcell
     scene: Clearances
     solver: InverseKinematics
     cell_size: float
     heights: dict[int, float] = field(default_factory=dict)  # top of each block, where it is now
-    joints: Floats = field(default_factory=lambda: np.zeros(6))
-    opening: float = 0.0
+    joints: Floats = field(init=False)
+    opening: float = field(init=False)
     held: int | None = None
     held_in_tip: Floats = field(default_factory=lambda: np.eye(4))
 
     def __post_init__(self) -> None:
-        self.joints = self.cell.home_joints
-        self.opening = self.cell.jaws.opening
+        self.joints = self.workcell.home_joints
+        self.opening = self.workcell.jaws.opening
 
     def block(self, block: int, waiting: Waiting, goal: Floats, touching: frozenset[int]) -> BlockPlan:
         """Fetch one block and place it."""
@@ -166,7 +168,7 @@ class _Planner:
         self.may_touch: frozenset[int] = frozenset()
         self.handled: int | None = block
         tip_in_block = np.linalg.inv(waiting.frame) @ waiting.grasp
-        if self.cell.staging.straighten:
+        if self.workcell.staging.straighten:
             self._straighten(waiting)
         grasp = waiting.grasp
         self._above(grasp)
@@ -175,24 +177,24 @@ class _Planner:
         self._close(block, tip_in_block)
         self.may_touch = frozenset({TABLE})
         place = goal @ tip_in_block
-        place[2, 3] += self.cell.workspace.drop
+        place[2, 3] += self.workcell.workspace.drop
         self._line("lift", self._raised(grasp, max(self._safe_height(grasp), self._safe_height(place))))
         self.may_touch = frozenset()
         self._above(place)
         self.may_touch = touching
         slow = _moved(place, _SLOW)
         self._line("lower", slow)
-        self._line("lower", place, speed=self.cell.speeds.touch)
+        self._line("lower", place, speed=self.workcell.speeds.touch)
         self._release(block, goal)
-        self._line("retreat", slow, speed=2 * self.cell.speeds.touch)
+        self._line("retreat", slow, speed=2 * self.workcell.speeds.touch)
         self._line("retreat", self._raised(place, self._safe_height(place)))
         return BlockPlan(block, waiting, goal, touching, tuple(self.actions), self.clearance, self.distance, self.turn)
 
     def _straighten(self, waiting: Waiting) -> None:
         """Push the block from both ends to the middle of its slot, with closed jaws."""
-        clear = max(self.cell.jaws.clearance, 0.01)
+        clear = max(self.workcell.jaws.clearance, 0.01)
         for number, side in enumerate((1, -1)):
-            beside, stop, away = push_path(waiting, side, self.cell)
+            beside, stop, away = push_path(waiting, side, self.workcell)
             over = waiting.top + clear
             if number == 0:
                 self._above(beside)
@@ -200,12 +202,12 @@ class _Planner:
             else:
                 self._line("straighten", self._raised(beside, over))
             self._line("straighten", beside)
-            self._line("straighten", stop, speed=self.cell.speeds.touch)
+            self._line("straighten", stop, speed=self.workcell.speeds.touch)
             self._line("straighten", away)
             self._line("straighten", self._raised(away, over))
 
     def _safe_height(self, tip: Floats) -> float:
-        """Of the finger tips, so that what they hold passes over everything else by the workspace's lift."""
+        """Height of the finger tips at which what they hold passes over everything else by the workspace's lift."""
         hangs = 0.0
         if self.handled is not None and self.held == self.handled:
             shape = self.scene.stack.catalogue[int(self.scene.stack.shapes[self.handled])]
@@ -213,19 +215,19 @@ class _Planner:
             corners = shape.vertices * self.cell_size @ frame[:3, :3].T + frame[:3, 3]
             hangs = float(tip[2, 3] - corners[:, 2].min())
         others = [top for number, top in self.heights.items() if number != self.held]
-        return max(others, default=0.0) + hangs + self.cell.workspace.lift
+        return max(others, default=0.0) + hangs + self.workcell.workspace.lift
 
     def _raised(self, tip: Floats, height: float) -> Floats:
-        """The same tip at a height, but never lower."""
+        """Raise a tip to a height; never lower it."""
         return _moved(tip, max(height - tip[2, 3], 0.0))
 
     def _above(self, tip: Floats) -> None:
-        """Transit to a safe height above a tip, higher where the way there would collide."""
+        """Move to a safe height above a tip, higher where the way there would collide."""
         height = self._safe_height(tip)
         start = self.joints
         for extra in _RISE:
             goal = self._solve(self._raised(tip, height + extra), start)
-            motion = joint_motion("transit", start, goal, self.cell.speeds)
+            motion = joint_motion("transit", start, goal, self.workcell.speeds)
             if motion is None:
                 return
             try:
@@ -236,8 +238,8 @@ class _Planner:
                     raise
 
     def _line(self, name: str, goal: Floats, speed: float | None = None) -> None:
-        """Straight on to a tip of the same direction."""
-        start = self.cell.tip_in_table(self.solver.chain.forward(self.joints))
+        """Move straight on to a tip of the same direction."""
+        start = self.workcell.tip_in_table(self.solver.arm.forward(self.joints))
         length = float(np.linalg.norm(goal[:3, 3] - start[:3, 3]))
         if length < 1e-6:
             return
@@ -247,15 +249,15 @@ class _Planner:
             tip = goal.copy()
             tip[:3, 3] = start[:3, 3] + (goal[:3, 3] - start[:3, 3]) * distance / length
             joints.append(self._solve(tip, joints[-1]))
-        speeds = self.cell.speeds
+        speeds = self.workcell.speeds
         self._append(line_motion(name, np.array(joints), distances, speed or speeds.line, speeds))
 
     def _solve(self, tip: Floats, near: Floats) -> Floats:
-        low, high = (np.array(corner) for corner in (self.cell.workspace.low, self.cell.workspace.high))
+        low, high = (np.array(corner) for corner in (self.workcell.workspace.low, self.workcell.workspace.high))
         if (tip[:3, 3] < low).any() or (tip[:3, 3] > high).any():
             x, y, z = tip[:3, 3]
             raise Unreachable(f"({x:.3f}, {y:.3f}, {z:.3f}) m lies outside cell.workspace")
-        solution = self.solver.solve(self.cell.flange_in_base(tip), near)
+        solution = self.solver.solve(self.workcell.flange_in_base(tip), near)
         self.distance, self.turn = max(self.distance, solution.distance), max(self.turn, solution.turn)
         return solution.joints
 
@@ -275,32 +277,32 @@ class _Planner:
     def _check(self, motion: Motion, joints: Floats) -> Near:
         self.scene.put_arm(joints, self.opening)
         if self.held is not None:
-            tip = self.cell.tip_in_table(self.solver.chain.forward(joints))
+            tip = self.workcell.tip_in_table(self.solver.arm.forward(joints))
             self.scene.put_block(self.held, tip @ self.held_in_tip)
         near = self.scene.of_arm(self.heights, self.handled)
-        if near.distance < self.cell.workspace.clearance:
+        if near.distance < self.workcell.workspace.clearance:
             raise Collision(f"{motion.name} would bring {near.between} within {near.distance * 1e3:.1f} mm")
         if self.held is None:
             return near
         beside = self.scene.of_block(self.held, self.heights, self.may_touch)
         # In its row a block passes its neighbours as near as the gaps that were made for it.
-        least = self.cell.workspace.gap / 3 if motion.kind == "line" else self.cell.workspace.clearance
+        least = self.workcell.workspace.gap / 3 if motion.kind == "line" else self.workcell.workspace.clearance
         if beside.distance < least:
             raise Collision(f"{motion.name} would bring {beside.between} within {beside.distance * 1e3:.1f} mm")
         return min(near, beside)
 
     def _open(self) -> None:
-        self.opening = self.cell.jaws.opening
+        self.opening = self.workcell.jaws.opening
         self.actions.append(Open(self.opening))
 
     def _shut(self) -> None:
         self.opening = 0.0
-        self.actions.append(Close(self.cell.jaws.force))
+        self.actions.append(Close(self.workcell.jaws.force))
 
     def _close(self, block: int, tip_in_block: Floats) -> None:
         shape = self.scene.stack.catalogue[int(self.scene.stack.shapes[block])]
         self.opening = shape.depth * self.cell_size
-        self.actions.append(Close(self.cell.jaws.force))
+        self.actions.append(Close(self.workcell.jaws.force))
         self.held, self.held_in_tip = block, np.array(np.linalg.inv(tip_in_block))
 
     def _release(self, block: int, goal: Floats) -> None:
@@ -309,7 +311,7 @@ class _Planner:
         self.held = None
 
     def put_down(self, block: int, goal: Floats) -> None:
-        """A block is at its place."""
+        """Note that a block is at its place."""
         self.scene.put_block(block, goal)
         shape = self.scene.stack.catalogue[int(self.scene.stack.shapes[block])]
         corners = shape.vertices * self.cell_size @ goal[:3, :3].T + goal[:3, 3]
@@ -317,5 +319,5 @@ class _Planner:
 
 
 def _moved(tip: Floats, up: float) -> Floats:
-    """The same tip, higher."""
+    """Move a tip up."""
     return pose((0.0, 0.0, up)) @ tip

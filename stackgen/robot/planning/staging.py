@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from stackgen.errors import StackgenError
 from stackgen.geometry import block_vertices, row_intervals
-from stackgen.robot.workcell import Cell, pose
+from stackgen.robot.workcell import Workcell, pose
 from stackgen.stack import Stack
 from stackgen.world import Shape
 
@@ -31,11 +31,11 @@ class Waiting:
     """A block in its slot.
 
     Args:
-        frame: (4, 4) of the block in the table frame.
-        grasp: (4, 4) of the finger tips there when they hold it.
+        frame: (4, 4) frame of the block in the table frame.
+        grasp: (4, 4) frame of the finger tips when they hold it there.
         ends: x of its left and right end in the slot's frame at the height at which fingers push it.
-        sweep: (4, 4) of the slot with the tool pointing down, at the height of the finger tips that push.
-        top: Its height.
+        sweep: (4, 4) frame of the slot with the tool pointing down, at the height of the finger tips that push.
+        top: Height of the block.
     """
 
     frame: Floats
@@ -45,27 +45,28 @@ class Waiting:
     top: float
 
 
-def lay_out(stack: Stack, order: tuple[int, ...], cell: Cell, cell_size: float) -> dict[int, Waiting]:
-    """A slot for each block, in the order in which they are fetched.
+def lay_out(stack: Stack, order: tuple[int, ...], workcell: Workcell, cell_size: float) -> dict[int, Waiting]:
+    """Give each block a slot, in the order in which they are fetched.
 
     Raises:
         StackgenError: If a block does not fit between the jaws or into a slot, there are too few slots, or a
             block leans so far that it cannot be set down.
     """
-    slots = cell.staging.slots
+    slots = workcell.staging.slots
     if len(order) > len(slots):
         raise StackgenError(
             f"the staging area is too small: {len(order)} blocks, but {len(slots)} slots; add to cell.staging.slots"
         )
     return {
-        block: wait(stack, block, slot, cell, cell_size) for block, slot in zip(order, slots[: len(order)], strict=True)
+        block: wait(stack, block, slot, workcell, cell_size)
+        for block, slot in zip(order, slots[: len(order)], strict=True)
     }
 
 
-def wait(stack: Stack, block: int, slot: tuple[float, float, float], cell: Cell, cell_size: float) -> Waiting:
-    """A block in one slot, on the face that is to be its lowest."""
+def wait(stack: Stack, block: int, slot: tuple[float, float, float], workcell: Workcell, cell_size: float) -> Waiting:
+    """Lay a block into a slot, on the face that is to be its lowest."""
     shape = stack.catalogue[int(stack.shapes[block])]
-    jaws, staging = cell.jaws, cell.staging
+    jaws, staging = workcell.jaws, workcell.staging
     who = f"block {block} ({shape.name})"
     need = shape.depth * cell_size + 2 * jaws.clearance
     if need > jaws.opening + 1e-9:
@@ -108,22 +109,28 @@ def wait(stack: Stack, block: int, slot: tuple[float, float, float], cell: Cell,
 _START = 0.012  # a pushing finger goes down this far beside where the block should end [m]
 
 
-def push_path(waiting: Waiting, side: int, cell: Cell) -> tuple[Floats, Floats, Floats]:
-    """Finger tips (4, 4) beside a block, where pushing ends, and backed off; side 1 is its right end, -1 its left."""
+def push_path(waiting: Waiting, side: int, workcell: Workcell) -> tuple[Floats, Floats, Floats]:
+    """Finger tips (4, 4) beside a block, where pushing ends, and backed off.
+
+    Args:
+        waiting: The block in its slot.
+        side: 1 for its right end, -1 for its left.
+        workcell: Workcell with the jaws.
+    """
     end = waiting.ends[1] if side > 0 else waiting.ends[0]
-    stop = end + side * cell.jaws.pad_width / 2
+    stop = end + side * workcell.jaws.pad_width / 2
     return tuple(_shifted(waiting.sweep, stop + side * away) for away in (_START, 0.0, 0.006))  # type: ignore[return-value]
 
 
 def _shifted(frame: Floats, x: float) -> Floats:
-    """A tool frame moved along its slot: the tool's own x axis points backwards."""
+    """Move a tool frame along its slot: the tool's own x axis points backwards."""
     return frame @ pose((-x, 0.0, 0.0))
 
 
 def resting_turn(shape: Shape, rotation_vector: Floats) -> Rotation | None:
-    """The turn about the block's depth that puts the face down that is its lowest; None if it leans too far.
+    """Find the turn about the block's depth that puts its lowest face down; None if it leans too far.
 
-    >>> from stackgen.stack import PAPER_CATALOGUE
+    >>> from stackgen.world import PAPER_CATALOGUE
     >>> import numpy as np
     >>> round(float(resting_turn(PAPER_CATALOGUE[1], np.array([0, 1.5, 0])).magnitude()), 4)
     1.5708
@@ -147,7 +154,7 @@ def _ends(points: Floats, height: float) -> tuple[float, float]:
 
 
 def make_room(stack: Stack, gap: float) -> Stack:
-    """The stack with blocks side by side moved apart along x, as little as gives them a gap [cell].
+    """Move blocks side by side apart along x, as little as gives them a gap [cell].
 
     Blocks that touch could not be set down one beside the other: the arm is not exact.
 

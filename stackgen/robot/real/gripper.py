@@ -29,19 +29,19 @@ _ACTIVATION = 15.0  # an activation opens and closes them once [s]
 
 @dataclass(frozen=True)
 class Gripper:
-    """How the real jaws are driven; their sizes are the cell's.
+    """How the real jaws are driven; their sizes are the workcell's.
 
     Args:
         kind: Robotiq's socket protocol, or a digital output of the controller.
-        host: Of Robotiq's server; the controller by default.
-        port: Of Robotiq's server.
+        host: Address of Robotiq's server; the controller by default.
+        port: Port of Robotiq's server.
         stroke: Opening at position 0 [m].
         weakest: Force at FOR 0 [N].
         strongest: Force at FOR 255 [N].
-        speed: Of the jaws, as a share of the largest.
+        speed: Speed of the jaws, as a share of the largest.
         output: Number of the standard digital output.
-        closed: Its level while the jaws are closed.
-        seconds: That jaws on a digital output take to open or close: they do not tell [s].
+        closed: Level of that output while the jaws are closed.
+        seconds: Time that jaws on a digital output take to open or close: they do not tell [s].
     """
 
     kind: Literal["robotiq", "digital"] = "robotiq"
@@ -69,7 +69,7 @@ class Gripper:
             raise StackgenError(f"gripper: port must lie in 1..65535, got {self.port}")
 
     def position(self, width: float) -> int:
-        """POS for an opening [m].
+        """Position (POS) for an opening [m].
 
         >>> Gripper().position(0.085), Gripper().position(0.0)
         (0, 255)
@@ -81,7 +81,7 @@ class Gripper:
         return self.stroke * (1 - position / POSITIONS)
 
     def force(self, newtons: float) -> int:
-        """FOR for a force [N].
+        """Number (FOR) for a force [N].
 
         >>> Gripper().force(20), Gripper().force(400)
         (0, 255)
@@ -91,11 +91,11 @@ class Gripper:
 
     @property
     def rate(self) -> int:
-        """SPE."""
+        """Number (SPE) for the speed."""
         return round(POSITIONS * self.speed)
 
 
-class Jaws(Protocol):
+class RealJaws(Protocol):
     """Real jaws. Every call returns when they are at rest."""
 
     def open(self, width: float) -> None:
@@ -123,12 +123,12 @@ class RobotiqJaws:
     """A Robotiq two-finger gripper.
 
     Args:
-        gripper: Its settings.
-        host: Where its server is.
+        gripper: Settings of the gripper.
+        host: Address of the controller.
         tick: Called while waiting, so that what else is alive stays so.
 
     Raises:
-        StackgenError: If nobody answers there.
+        StackgenError: If no gripper answers there.
     """
 
     def __init__(self, gripper: Gripper, host: str, tick: Callable[[], None] = lambda: None) -> None:
@@ -177,7 +177,7 @@ class RobotiqJaws:
             self._socket.close()
 
     def get(self, name: str) -> int:
-        """A variable's value."""
+        """Read a variable."""
         answer = self._ask(f"GET {name}").split()
         if len(answer) != 2 or answer[0] != name or not answer[1].lstrip("-").isdigit():
             raise StackgenError(f"the gripper at {self.where} answered {' '.join(answer)!r} when asked for {name}")
@@ -191,7 +191,7 @@ class RobotiqJaws:
             raise StackgenError(f"the gripper at {self.where} answered {answer!r} to SET {words}")
 
     def _go(self, position: int, force: float) -> int:
-        """Move to a POS and wait; answers OBJ."""
+        """Move to a position, wait, and return OBJ."""
         self.set(FOR=self.gripper.force(force), SPE=self.gripper.rate, POS=position, GTO=1)
         self._wait("take the order", lambda: self.get("PRE") == position, _PATIENCE)
         self._wait("come to rest", lambda: self.get("OBJ") != MOVING, _PATIENCE)
@@ -230,7 +230,7 @@ class DigitalJaws:
     """Jaws that one digital output opens and closes.
 
     Args:
-        gripper: Number of the output, its level, and how long they take.
+        gripper: Settings: number of the output, its level, and how long they take.
         set_output: Sets a standard digital output to a level.
         tick: Called while waiting.
     """

@@ -1,4 +1,4 @@
-"""What a UR controller is asked: the motions of a plan as poses of its own base frame, within the cell's limits.
+"""The motions of a plan as a UR controller is asked for them: poses in its own base frame, within the limits.
 
 A plan's motions are joint angles of the nominal arm. Every real arm is a little different, and its controller knows
 how: it is told where the finger tips are to be, and which joint angles are near. So it places blocks as exactly as it
@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stackgen.errors import StackgenError
-from stackgen.robot.backend import Close
-from stackgen.robot.planning.motion import Motion
+from stackgen.robot.planning.arm_model import arm_model
+from stackgen.robot.planning.motion import Close, Motion
 from stackgen.robot.planning.plan import BlockPlan
-from stackgen.robot.planning.urdf import Chain, ur5_chain
-from stackgen.robot.workcell import Cell, pose
+from stackgen.robot.workcell import Workcell, pose
 
 Floats = NDArray[np.float64]
 
@@ -36,12 +35,12 @@ class Controller:
     """The real arm's controller, and what hangs on its flange.
 
     Args:
-        host: Its address; --host overrides it.
-        payload: Of the jaws [kg].
-        center_of_gravity: Of the jaws in the flange's frame [m].
-        near_home: How far each joint may stand from the home position when a build begins [deg].
-        agreement: Between where the controller says the finger tips are and where the URDF does [m]; more is
-            another arm, or another tool.
+        host: Address of the controller; --host overrides it.
+        payload: Mass of the jaws [kg].
+        center_of_gravity: Centre of gravity of the jaws in the flange's frame [m].
+        near_home: Largest angle of each joint from the home position when a build begins [deg].
+        agreement: Largest distance between where the controller says the finger tips are and where the URDF does
+            [m]; more is another arm, or another tool.
     """
 
     host: str = ""
@@ -61,12 +60,12 @@ class Move:
     """One motion as a controller is asked for it.
 
     Args:
-        name: Its part in the work.
+        name: Part in the work.
         kind: `joint` (movej) or `line` (movel).
-        pose: (6,) of the finger tips in the controller's base frame, position [m] and rotation vector [rad].
-        joints: (6,) of the nominal arm there [rad].
-        speed: Of the leading joint [rad/s], or of the tool [m/s].
-        acceleration: Likewise [rad/s^2, m/s^2].
+        pose: (6,) pose of the finger tips in the controller's base frame, position [m] and rotation vector [rad].
+        joints: (6,) joint angles of the nominal arm there [rad].
+        speed: Speed of the leading joint [rad/s], or of the tool [m/s].
+        acceleration: Acceleration of the leading joint [rad/s^2], or of the tool [m/s^2].
     """
 
     name: str
@@ -77,33 +76,35 @@ class Move:
     acceleration: float
 
 
-def tool_offset(cell: Cell) -> tuple[float, ...]:
-    """(6,) the finger tips in the flange's frame, as `set_tcp` takes it."""
-    return (*cell.jaws.flange_from_tip[:3, 3].tolist(), 0.0, 0.0, 0.0)
+def tool_offset(workcell: Workcell) -> tuple[float, ...]:
+    """Pose (6,) of the finger tips in the flange's frame, as `set_tcp` takes it."""
+    return (*workcell.jaws.flange_from_tip[:3, 3].tolist(), 0.0, 0.0, 0.0)
 
 
-def controller_pose(joints: Floats, cell: Cell, chain: Chain | None = None) -> Floats:
-    """(6,) pose of the finger tips in the controller's base frame, for joint angles (6,) [rad]."""
-    tip = CONTROLLER_FROM_BASE @ (chain or ur5_chain()).forward(joints) @ cell.jaws.flange_from_tip
+def controller_pose(joints: Floats, workcell: Workcell) -> Floats:
+    """Pose (6,) of the finger tips in the controller's base frame, for joint angles (6,) [rad]."""
+    tip = CONTROLLER_FROM_BASE @ arm_model(workcell.arm).forward(joints) @ workcell.jaws.flange_from_tip
     return np.concatenate([tip[:3, 3], Rotation.from_matrix(tip[:3, :3]).as_rotvec()])
 
 
-def controller_move(motion: Motion, cell: Cell) -> Move:
-    """A motion with the largest speed and acceleration that were planned for it.
+def controller_move(motion: Motion, workcell: Workcell) -> Move:
+    """Give a motion the largest speed and acceleration that were planned for it.
 
     Raises:
-        StackgenError: If it leaves the cell's workspace, or is faster than the cell allows.
+        StackgenError: If it leaves the workcell's workspace, or is faster than the workcell allows.
     """
     times = np.linspace(0, motion.duration, _SAMPLES)
     positions, velocities = motion.at(times)
-    check_workspace(motion.name, positions, cell)
+    check_workspace(motion.name, positions, workcell)
     if motion.kind == "joint":
         rates = np.abs(velocities).max(axis=1)
-        limits, unit = np.radians([cell.speeds.joint, cell.speeds.joint_acceleration]), "rad"
+        limits, unit = np.radians([workcell.speeds.joint, workcell.speeds.joint_acceleration]), "rad"
     else:
-        tool = np.array([ur5_chain().jacobian(q)[:3] @ v for q, v in zip(positions, velocities, strict=True)])
+        tool = np.array(
+            [arm_model(workcell.arm).jacobian(q)[:3] @ v for q, v in zip(positions, velocities, strict=True)]
+        )
         rates = np.linalg.norm(tool, axis=1)
-        limits, unit = np.array([cell.speeds.line, cell.speeds.line_acceleration]), "m"
+        limits, unit = np.array([workcell.speeds.line, workcell.speeds.line_acceleration]), "m"
     speed, acceleration = float(rates.max()), float(np.abs(np.diff(rates) / np.diff(times)).max())
     if speed > limits[0] * 1.01 or acceleration > limits[1] * 1.01:
         raise StackgenError(
@@ -114,22 +115,22 @@ def controller_move(motion: Motion, cell: Cell) -> Move:
     return Move(
         motion.name,
         motion.kind,
-        controller_pose(end, cell),
+        controller_pose(end, workcell),
         end,
         float(np.clip(speed, _SLOWEST, limits[0])),
         float(np.clip(acceleration, _SLOWEST, limits[1])),
     )
 
 
-def check_workspace(name: str, positions: Floats, cell: Cell) -> None:
+def check_workspace(name: str, positions: Floats, workcell: Workcell) -> None:
     """See that the finger tips stay in the workspace at joint angles (T, 6) [rad].
 
     Raises:
         StackgenError: If they do not.
     """
-    low, high = np.array(cell.workspace.low) - _SLACK, np.array(cell.workspace.high) + _SLACK
+    low, high = np.array(workcell.workspace.low) - _SLACK, np.array(workcell.workspace.high) + _SLACK
     for joints in positions:
-        tip = cell.tip_in_table(ur5_chain().forward(joints))[:3, 3]
+        tip = workcell.tip_in_table(arm_model(workcell.arm).forward(joints))[:3, 3]
         if (tip < low).any() or (tip > high).any():
             x, y, z = tip
             raise StackgenError(
@@ -144,10 +145,10 @@ class Grasps:
         self._left = 0
 
     def begin(self, step: BlockPlan) -> None:
-        """A block is begun."""
+        """Note that a block is begun."""
         self._left = sum(isinstance(action, Close) for action in step.actions)
 
     def is_grasp(self) -> bool:
-        """Whether the jaws that close now take the block."""
+        """Tell whether the jaws that close now take the block."""
         self._left -= 1
         return self._left == 0

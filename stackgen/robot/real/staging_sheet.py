@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from stackgen.errors import StackgenError
+from stackgen.errors import StackgenError, require
 from stackgen.io.files import write_atomically
 from stackgen.robot.planning.staging import Waiting, lay_out
-from stackgen.robot.workcell import Cell, pose
+from stackgen.robot.workcell import Workcell, pose
 from stackgen.stack import Stack
 from stackgen.world import Shape
 
@@ -38,16 +38,16 @@ SUFFIXES = (".pdf", ".svg")
 
 
 @dataclass(frozen=True)
-class Place:
+class SlotDrawing:
     """A block in its slot, on paper.
 
     Args:
-        slot: Its number, from 1.
-        block: Its number in the stack.
-        shape: Its name.
-        border: (4, 2) of the slot.
-        outline: (V, 2) of the block as it lies, seen from above.
-        front: (V, 2) of the block as it lies, seen from the front of its slot, around the origin.
+        slot: Number of the slot, from 1.
+        block: Number of the block in the stack.
+        shape: Name of its shape.
+        border: (4, 2) border of the slot.
+        outline: (V, 2) outline of the block as it lies, seen from above.
+        front: (V, 2) outline of the block as it lies, seen from the front of its slot, around the origin.
     """
 
     slot: int
@@ -58,47 +58,51 @@ class Place:
     front: Floats
 
 
-def places(stack: Stack, order: tuple[int, ...], cell: Cell, cell_size: float) -> list[Place]:
-    """Where the blocks lie, in the order in which they are fetched.
+def places(stack: Stack, order: tuple[int, ...], workcell: Workcell, cell_size: float) -> list[SlotDrawing]:
+    """Draw where the blocks lie, in the order in which they are fetched.
 
     Raises:
         StackgenError: If they do not fit into the staging area.
     """
-    waiting = lay_out(stack, order, cell, cell_size)
+    waiting = lay_out(stack, order, workcell, cell_size)
     return [
-        _place(number, block, waiting[block], stack.catalogue[int(stack.shapes[block])], cell, cell_size)
+        _place(number, block, waiting[block], stack.catalogue[int(stack.shapes[block])], workcell, cell_size)
         for number, block in enumerate(order, 1)
     ]
 
 
-def _place(number: int, block: int, waiting: Waiting, shape: Shape, cell: Cell, cell_size: float) -> Place:
+def _place(
+    number: int, block: int, waiting: Waiting, shape: Shape, workcell: Workcell, cell_size: float
+) -> SlotDrawing:
     corners = shape.vertices * cell_size @ waiting.frame[:3, :3].T + waiting.frame[:3, 3]
-    x, y, turn = cell.staging.slots[number - 1]
+    x, y, turn = workcell.staging.slots[number - 1]
     slot = pose((x, y, 0.0), turn)
-    half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [cell.staging.length / 2, cell.staging.depth / 2]
+    half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [workcell.staging.length / 2, workcell.staging.depth / 2]
     border = half @ slot[:2, :2].T + [x, y]
     in_slot = (corners - slot[:3, 3]) @ slot[:3, :3]
     front = _hull(in_slot[:, [0, 2]])
     middle = (front.min(axis=0) + front.max(axis=0)) / 2
-    return Place(number, block, shape.name, border * 1e3, _hull(corners[:, :2]) * 1e3, (front - middle) * 1e3)
+    return SlotDrawing(number, block, shape.name, border * 1e3, _hull(corners[:, :2]) * 1e3, (front - middle) * 1e3)
 
 
-def write_staging_sheet(path: Path, stack: Stack, order: tuple[int, ...], cell: Cell, cell_size: float) -> None:
+def write_staging_sheet(
+    path: Path, stack: Stack, *, order: tuple[int, ...], workcell: Workcell, cell_size: float
+) -> None:
     """Write the sheet.
 
     Args:
-        path: A .pdf or an .svg.
-        stack: What is built.
-        order: In which its blocks are fetched.
-        cell: With the slots.
+        path: File to write, a .pdf or an .svg.
+        stack: Stack that is built.
+        order: (k,) numbers of its blocks in the order in which they are fetched.
+        workcell: Workcell with the slots.
         cell_size: Edge of a cube [m].
 
     Raises:
         StackgenError: If the suffix is another, the blocks do not fit, or the file cannot be written.
     """
     check_suffix(path)
-    found = places(stack, order, cell, cell_size)
-    write_atomically(path, _svg(found, cell) if path.suffix.lower() == ".svg" else _pdf(found, cell))
+    found = places(stack, order, workcell, cell_size)
+    write_atomically(path, _svg(found, workcell) if path.suffix.lower() == ".svg" else _pdf(found, workcell))
 
 
 def check_suffix(path: Path) -> None:
@@ -111,14 +115,14 @@ def check_suffix(path: Path) -> None:
         raise StackgenError(f"--staging_sheet {path}: sheets are written as {' or '.join(SUFFIXES)}; change the suffix")
 
 
-def area(found: list[Place]) -> tuple[Floats, Floats]:
-    """Corners of the rectangle around slots and structure."""
+def area(found: list[SlotDrawing]) -> tuple[Floats, Floats]:
+    """Find the corners of the rectangle around slots and structure."""
     points = np.concatenate([place.border for place in found] + [np.array([[-20.0, -20.0], [20.0, 20.0]])])
     return points.min(axis=0), points.max(axis=0)
 
 
-def tiles(found: list[Place]) -> Iterator[tuple[Floats, tuple[int, int]]]:
-    """Lower left corner of each page with something on it, and its row (from below) and column, from 1."""
+def tiles(found: list[SlotDrawing]) -> Iterator[tuple[Floats, tuple[int, int]]]:
+    """Yield the lower left corner of each page with something on it, and its row (from below) and column, from 1."""
     low, high = area(found)
     size = np.array(PAGE) - 2 * MARGIN
     columns, rows = np.ceil((high - low) / size).astype(int)
@@ -130,21 +134,22 @@ def tiles(found: list[Place]) -> Iterator[tuple[Floats, tuple[int, int]]]:
                 yield corner, (row + 1, column + 1)
 
 
-def _pdf(found: list[Place], cell: Cell) -> bytes:
-    from matplotlib.backends.backend_pdf import PdfPages
-
+def _pdf(found: list[SlotDrawing], workcell: Workcell) -> bytes:
     data = io.BytesIO()
+    pdf_pages = require("matplotlib.backends.backend_pdf", "robot").PdfPages
     size = np.array(PAGE) - 2 * MARGIN
-    with PdfPages(data, metadata={"Title": "stackgen staging sheet", "CreationDate": None}) as pages:
+    with pdf_pages(data, metadata={"Title": "stackgen staging sheet", "CreationDate": None}) as pages:
         low, high = area(found)
-        _page(pages.savefig, PAGE[::-1], (low - 30, high + 30), found, cell, "Overview (not to scale)", True)
+        title = "Overview (not to scale)"
+        window = low - 30, high + 30
+        _page(pages.savefig, PAGE[::-1], window, found=found, workcell=workcell, title=title, overview=True)
         for corner, (row, column) in tiles(found):
             title = f"Row {row} from below, column {column} from the left: print at 100 %, cut along the frame"
-            _page(pages.savefig, PAGE, (corner, corner + size), found, cell, title, False)
+            _page(pages.savefig, PAGE, (corner, corner + size), found=found, workcell=workcell, title=title)
     return data.getvalue()
 
 
-def _svg(found: list[Place], cell: Cell) -> bytes:
+def _svg(found: list[SlotDrawing], workcell: Workcell) -> bytes:
     data = io.BytesIO()
     low, high = area(found)
     size = tuple(high - low + 2 * MARGIN)
@@ -152,7 +157,7 @@ def _svg(found: list[Place], cell: Cell) -> bytes:
     def save(figure: Figure) -> None:
         figure.savefig(data, format="svg", metadata={"Date": None})
 
-    _page(save, (float(size[0]), float(size[1])), (low, high), found, cell, "Plot at 100 %", False)
+    _page(save, (float(size[0]), float(size[1])), (low, high), found=found, workcell=workcell, title="Plot at 100 %")
     return data.getvalue()
 
 
@@ -160,15 +165,14 @@ def _page(
     save: Callable[[Figure], Any],
     page: tuple[float, float],
     window: tuple[Floats, Floats],
-    found: list[Place],
-    cell: Cell,
+    *,
+    found: list[SlotDrawing],
+    workcell: Workcell,
     title: str,
-    overview: bool,
+    overview: bool = False,
 ) -> None:
-    """One page that shows a window of the table; 1 mm is 1 mm unless it is the overview."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(page[0] / _INCH, page[1] / _INCH))
+    """Draw a page that shows a window of the table; 1 mm is 1 mm unless it is the overview."""
+    figure = require("matplotlib.figure", "robot").Figure(figsize=(page[0] / _INCH, page[1] / _INCH))
     box = (MARGIN / page[0], MARGIN / page[1], 1 - 2 * MARGIN / page[0], 1 - 2 * MARGIN / page[1])
     axes = figure.add_axes(box)
     (left, bottom), (right, top) = window
@@ -178,7 +182,7 @@ def _page(
     for place in found:
         _draw(axes, place, 6 if overview else 11)
     _marks(axes, window, overview)
-    x, y, _ = (1e3 * number for number in cell.base.position)
+    x, y, _ = (1e3 * number for number in workcell.base.position)
     axes.plot([x], [y], "o", color="black", markersize=8)
     axes.annotate("arm", (x, y), (6, 6), textcoords="offset points", fontsize=7, annotation_clip=True)
     axes.plot([0], [0], "+", color="black", markersize=18)
@@ -189,7 +193,7 @@ def _page(
     save(figure)
 
 
-def _draw(axes: Axes, place: Place, font: float) -> None:
+def _draw(axes: Axes, place: SlotDrawing, font: float) -> None:
     from matplotlib.patches import Polygon
 
     axes.add_patch(Polygon(place.border, closed=True, fill=False, linestyle=":", linewidth=0.5))
@@ -206,7 +210,7 @@ def _draw(axes: Axes, place: Place, font: float) -> None:
 
 
 def _marks(axes: Axes, window: tuple[Floats, Floats], overview: bool) -> None:
-    """Crosses of the table's coordinates, to join pages and to check the scale with a ruler."""
+    """Draw crosses of the table's coordinates, to join pages and to check the scale with a ruler."""
     low, high = window
     step = 2 * _MARKS if overview else _MARKS
     xs, ys = (np.arange(np.ceil(a / step), b / step + 1e-9) * step for a, b in zip(low, high, strict=True))

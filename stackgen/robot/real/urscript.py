@@ -6,13 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.robot.backend import ArmState
-from stackgen.robot.build import execute
+from stackgen.robot.backend import ArmState, execute
 from stackgen.robot.planning.motion import Motion
 from stackgen.robot.planning.plan import BlockPlan, BuildPlan
 from stackgen.robot.real.gripper import ACTIVE, HOLDS, MOVING, POSITIONS, Gripper
 from stackgen.robot.real.program import Controller, Grasps, controller_move, tool_offset
-from stackgen.robot.workcell import Cell
+from stackgen.robot.workcell import Workcell
 from stackgen.stack import Stack
 
 Floats = NDArray[np.float64]
@@ -24,23 +23,23 @@ class UrScriptFile:
     """An arm that writes down what it is told to do.
 
     Args:
-        cell: Its limits; a motion beyond them is refused.
-        controller: The tool's payload, and how near home the arm must be.
-        gripper: How the jaws are driven.
+        workcell: Limits of the arm; a motion beyond them is refused.
+        controller: Payload of the tool, and how near home the arm must be.
+        gripper: Settings of the jaws.
     """
 
-    def __init__(self, cell: Cell, controller: Controller, gripper: Gripper) -> None:
-        self.cell, self.controller, self.gripper = cell, controller, gripper
+    def __init__(self, workcell: Workcell, controller: Controller, gripper: Gripper) -> None:
+        self.workcell, self.controller, self.gripper = workcell, controller, gripper
         self.lines: list[str] = []
         self._grasps, self._doing = Grasps(), ""
-        self._joints, self._opening = cell.home_joints, cell.jaws.opening
+        self._joints, self._opening = workcell.home_joints, workcell.jaws.opening
 
     def begin(self, step: BlockPlan, stack: Stack, slot: int) -> None:
-        """A block is begun.
+        """Note that a block is begun.
 
         Args:
-            step: Its plan.
-            stack: Whose block it is.
+            step: Plan of the block.
+            stack: Stack of the block.
             slot: Number of the slot where it waits, from 1.
         """
         self._grasps.begin(step)
@@ -53,7 +52,7 @@ class UrScriptFile:
     def move(self, motion: Motion) -> None:
         """Write a movej or a movel."""
         try:
-            move = controller_move(motion, self.cell)
+            move = controller_move(motion, self.workcell)
         except StackgenError as error:
             raise StackgenError(f"{self._doing}{error}") from error
         target = f"p{numbers(move.pose)}"
@@ -69,14 +68,14 @@ class UrScriptFile:
         self._opening = width
 
     def close(self, force: float) -> None:
-        """Write the closing of the jaws; the one that takes the block looks whether it did."""
+        """Write the closing of the jaws; the closing that takes the block checks that it did."""
         self.say(f"jaws_close({self.gripper.force(force)})" if self._robotiq else "jaws_close()")
         if self._grasps.is_grasp() and self._robotiq:
             self.say("jaws_must_hold()")
         self._opening = 0.0
 
     def state(self) -> ArmState:
-        """Where the program has got to."""
+        """Tell where the program has got to."""
         return ArmState(self._joints, self._opening)
 
     def stop(self) -> None:
@@ -84,11 +83,11 @@ class UrScriptFile:
         self.say("halt")
 
     def say(self, line: str) -> None:
-        """One more line."""
+        """Write a line."""
         self.lines.append(_INDENT + line)
 
     def comment(self, text: str) -> None:
-        """A comment."""
+        """Write a comment."""
         self.lines.append(f"{_INDENT}# {text}".rstrip() if text else "")
 
     @property
@@ -96,7 +95,7 @@ class UrScriptFile:
         return self.gripper.kind == "robotiq"
 
     def program(self, title: str) -> str:
-        """All of it as text.
+        """Program as text.
 
         Args:
             title: What is built, in a line.
@@ -104,14 +103,14 @@ class UrScriptFile:
         head = [
             "def stackgen_build():",
             f"{_INDENT}# {title}",
-            f"{_INDENT}# Written by stackgen for this cell alone: read it, and run it slowly the first time.",
+            f"{_INDENT}# Written by stackgen for this workcell alone: read it, and run it slowly the first time.",
             f"{_INDENT}# Poses are those of the finger tips in the controller's base frame [m, rad].",
-            f"{_INDENT}set_tcp(p{numbers(np.array(tool_offset(self.cell)))})",
+            f"{_INDENT}set_tcp(p{numbers(np.array(tool_offset(self.workcell)))})",
             f"{_INDENT}set_payload({self.controller.payload:g}, {numbers(self.controller.center_of_gravity)})",
         ]
         parts = [_HALT, _NEAR_HOME, _ROBOTIQ if self._robotiq else _DIGITAL]
         values = {
-            "HOME": numbers(self.cell.home_joints),
+            "HOME": numbers(self.workcell.home_joints),
             "NEAR": f"{np.radians(self.controller.near_home):.4f}",
             "HOST": self.gripper.host or "127.0.0.1",
             "PORT": str(self.gripper.port),
@@ -133,20 +132,20 @@ class UrScriptFile:
         return "\n".join([*head, *self.lines, f'{_INDENT}textmsg("stackgen: done")', "end", ""])
 
 
-def urscript(plan: BuildPlan, cell: Cell, controller: Controller, gripper: Gripper, title: str = "") -> str:
-    """A plan as a program that the arm can run on its own.
+def urscript(plan: BuildPlan, workcell: Workcell, controller: Controller, gripper: Gripper, *, title: str = "") -> str:
+    """Write a plan as a program that the arm can run on its own.
 
     Args:
-        plan: Of the build.
-        cell: Of the plan.
-        controller: Payload, and how near home the arm must be.
-        gripper: How the jaws are driven.
+        plan: Plan of the build.
+        workcell: Workcell of the plan.
+        controller: Payload of the tool, and how near home the arm must be.
+        gripper: Settings of the jaws.
         title: What is built; the number of blocks by default.
 
     Raises:
-        StackgenError: If a motion leaves the cell's workspace or is too fast.
+        StackgenError: If a motion leaves the workcell's workspace or is too fast.
     """
-    arm = UrScriptFile(cell, controller, gripper)
+    arm = UrScriptFile(workcell, controller, gripper)
     slots = {block: number for number, block in enumerate(plan.order, 1)}
     execute(plan, arm, on_start=lambda step: arm.begin(step, plan.stack, slots[step.block]))
     count = f"{len(plan.blocks)} of {len(plan.stack)} blocks"
@@ -154,7 +153,7 @@ def urscript(plan: BuildPlan, cell: Cell, controller: Controller, gripper: Gripp
 
 
 def numbers(values: Floats | tuple[float, ...]) -> str:
-    """A list as URScript writes it.
+    """Write a list as URScript does.
 
     >>> numbers((0.5, -1e-9))
     '[0.5, 0]'

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.errors import StackgenError
+from stackgen.errors import StackgenError, require
 from stackgen.io.files import require_folder, write_atomically
 from stackgen.robot.simulated.arm import SimulatedArm
 from stackgen.sim.simulator import bullet
@@ -31,20 +31,22 @@ def check_film(path: Path) -> None:
     """See that a film can be written under this name.
 
     Raises:
-        StackgenError: If the suffix is unknown, or there is no folder for it.
+        StackgenError: If the suffix is unknown, there is no folder for it, or an MP4 lacks its encoder.
     """
     if path.suffix.lower() not in SUFFIXES:
         raise StackgenError(f"--video {path}: films are written as {' or '.join(SUFFIXES)}; change the suffix")
+    if path.suffix.lower() != ".gif":
+        require("av", "film")
     require_folder(path.parent, f"--video {path}")
 
 
 def picture(client: int, size: tuple[int, int] = (640, 480), near: bool = False) -> Picture:
-    """(H, W, 3) what a camera in front of the table sees.
+    """Picture (H, W, 3) that a camera in front of the table takes.
 
     Args:
-        client: Of the world.
+        client: Bullet's number of the simulation.
         size: (width, height) [pixel].
-        near: Whether of the structure below the jaws, or of all of the arm.
+        near: Whether to show the structure below the jaws, or all of the arm.
     """
     target, distance, pitch = ([0, 0, 0.19], 0.85, -14) if near else ([0, 0.08, 0.2], 1.3, -20)
     view = bullet.computeViewMatrixFromYawPitchRoll(target, distance, 18, pitch, 0, 2)
@@ -63,11 +65,11 @@ def picture(client: int, size: tuple[int, int] = (640, 480), near: bool = False)
 
 
 def outlined(colours: Picture, bodies: NDArray[np.int_]) -> Picture:
-    """(H, W, 3) with a plain table and wall, and a line around every body: blocks of one colour touch.
+    """Picture (H, W, 3) with a plain table and wall, and a line around every body: blocks of one colour touch.
 
     Args:
         colours: (H, W, 3) as Bullet draws it.
-        bodies: (H, W) the body of each pixel, negative for none, 0 for the table.
+        bodies: (H, W) body of each pixel, negative for none, 0 for the table.
     """
     shown = colours.copy()
     shown[bodies < 0], shown[bodies == 0] = _WALL, _TABLE
@@ -82,15 +84,15 @@ class Film:
     """Records a build.
 
     Args:
-        picture: PNG of the finished stack.
-        video: MP4 or GIF, if wanted; it appears when all of it is written.
+        picture: PNG file for the finished stack.
+        video: MP4 or GIF file, if wanted; it appears when all of it is written.
     """
 
     def __init__(self, picture: Path, video: Path | None = None) -> None:
         self.picture, self.video = picture, video
 
     def camera(self, arm: SimulatedArm) -> Callable[[bool], None]:
-        """What is called after every step of an arm, and once at the end."""
+        """Make what is called after every step of an arm, and once at the end."""
         writer = None if self.video is None else _Writer(self.video)
         every = max(1, round(SPEED / FRAMES / arm.physics.time_step))
 
@@ -113,28 +115,27 @@ class _Writer:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._av: Any = None if path.suffix.lower() == ".gif" else require("av", "film")
         self._content = io.BytesIO()
         self._mp4: Any = None
         self._gif: list[Any] = []
 
     def add(self, frame: Picture) -> None:
-        """One more frame (H, W, 3); both even for an MP4."""
-        if self.path.suffix.lower() == ".gif":
+        """Add a frame (H, W, 3); H and W are even for an MP4."""
+        if self._av is None:
             from PIL import Image
 
             self._gif.append(Image.fromarray(frame).quantize(64))
             return
-        import av
-
         if self._mp4 is None:
-            self._mp4 = av.open(self._content, "w", format="mp4")
+            self._mp4 = self._av.open(self._content, "w", format="mp4")
             stream = self._mp4.add_stream("libx264", FRAMES)  # what browsers play
             stream.height, stream.width = frame.shape[:2]
             stream.pix_fmt = "yuv420p"
-        self._encode(av.VideoFrame.from_ndarray(frame, format="rgb24"))
+        self._encode(self._av.VideoFrame.from_ndarray(frame, format="rgb24"))
 
     def _encode(self, frame: Any) -> None:
-        """Take a frame, or with None what is still held back."""
+        """Encode a frame, or with None what is still held back."""
         self._mp4.mux(self._mp4.streams.video[0].encode(frame))
 
     def finish(self) -> None:

@@ -17,11 +17,11 @@ RATE = 25.0
 
 
 class Window:
-    """Shows an arm and its blocks while they move; who closes it does not stop the build.
+    """Shows an arm and its blocks while they move; closing it does not stop the build.
 
     Args:
-        arm: What is shown.
-        mode: Of Bullet's connection; a window by default.
+        arm: The arm that is shown.
+        mode: Mode of Bullet's connection; a window by default.
 
     Raises:
         StackgenError: If there is no display to open one on.
@@ -36,14 +36,14 @@ class Window:
         for switch in (bullet.COV_ENABLE_GUI, bullet.COV_ENABLE_SHADOWS, bullet.COV_ENABLE_RENDERING):
             bullet.configureDebugVisualizer(switch, 0, physicsClientId=self.client)
         bullet.resetDebugVisualizerCamera(1.1, 20, -25, [0, 0.05, 0.15], physicsClientId=self.client)
-        self.body = load_arm(arm.cell, self.client, visual=True)
+        self.body = load_arm(arm.workcell, self.client, visual=True)
         self.blocks = [self._block(number) for number in range(len(arm.stack))]
         bullet.configureDebugVisualizer(bullet.COV_ENABLE_RENDERING, 1, physicsClientId=self.client)
         self._every = max(1, round(1 / RATE / arm.physics.time_step))
         self.show()
 
     def step(self) -> None:
-        """What is called after every step of the arm."""
+        """Show a picture, if it is time; called after every step of the arm."""
         if self.arm.steps % self._every == 0:
             self.show()
 
@@ -59,7 +59,7 @@ class Window:
             for ours, theirs in zip(self.blocks, self.arm.blocks, strict=True):
                 place = bullet.getBasePositionAndOrientation(theirs, physicsClientId=self.arm.client)
                 bullet.resetBasePositionAndOrientation(ours, *place, physicsClientId=self.client)
-        except bullet.error:  # closed by whoever looked
+        except bullet.error:  # the window was closed
             self.client = -1
 
     def close(self) -> None:
@@ -96,7 +96,7 @@ def require_display() -> None:
 
 
 def _answers(display: str) -> bool:
-    """Whether an X server is there, by the library that Bullet's window uses."""
+    """Check whether an X server is there, by the library that Bullet's window uses."""
     try:
         x11 = ctypes.CDLL("libX11.so.6")
     except OSError:

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from stackgen.robot.planning.arm_model import arm_model
 from stackgen.robot.planning.kinematics import ClosedForm
 from stackgen.robot.planning.motion import Motion, joint_motion, line_motion
 from stackgen.robot.planning.staging import TIP_UP
-from stackgen.robot.workcell import Cell, Speeds, pose
+from stackgen.robot.workcell import Speeds, Workcell, pose
 
-CELL, SPEEDS = Cell(), Speeds()
-HOME = CELL.home_joints
+ARM = arm_model(Workcell().arm)
+WORKCELL, SPEEDS = Workcell(), Speeds()
+HOME = WORKCELL.home_joints
 GOAL = HOME + np.array([0.8, -0.2, 0.3, 0.1, 0.0, -0.4])
 
 
@@ -49,13 +51,13 @@ def test_nothing_to_do_is_no_motion() -> None:
 
 
 def test_a_line_is_straight_in_space_and_as_slow_as_asked_for() -> None:
-    kinematics = ClosedForm(HOME)
+    kinematics = ClosedForm(ARM, HOME)
     heights = np.linspace(0.25, 0.02, 13)
     joints = [HOME]
     for height in heights:
-        joints.append(kinematics.solve(CELL.flange_in_base(pose((0.1, 0.0, height)) @ TIP_UP), joints[-1]).joints)
+        joints.append(kinematics.solve(WORKCELL.flange_in_base(pose((0.1, 0.0, height)) @ TIP_UP), joints[-1]).joints)
     found = line_motion("lower", np.array(joints[1:]), heights[0] - heights, 0.1, SPEEDS)
-    tips = np.array([CELL.tip_in_table(kinematics.chain.forward(q))[:3, 3] for q in found.positions])
+    tips = np.array([WORKCELL.tip_in_table(ARM.forward(q))[:3, 3] for q in found.positions])
     assert np.abs(tips[:, :2] - [0.1, 0.0]).max() < 2e-4
     speeds = np.linalg.norm(np.diff(tips, axis=0), axis=1) / np.diff(found.times)
     assert speeds.max() == pytest.approx(0.1, rel=0.02)

@@ -13,7 +13,7 @@ import pytest
 from stackgen.errors import StackgenError
 from stackgen.geometry import block_vertices
 from stackgen.robot.planning.staging import lay_out, make_room, push_path
-from stackgen.robot.workcell import Cell, Jaws, Staging
+from stackgen.robot.workcell import Jaws, Staging, Workcell
 from stackgen.stack import Stack
 from stackgen.world import PAPER_CATALOGUE
 
@@ -22,8 +22,8 @@ def stack_of(shapes: Sequence[int], poses: Sequence[Sequence[float]]) -> Stack:
     return Stack(np.array(shapes), np.array(poses, dtype=float))
 
 
-CELL, SIZE = Cell(), 0.05
-FEW = Cell(staging=Staging(slots=((0.3, 0.0, 0.0),)))
+WORKCELL, SIZE = Workcell(), 0.05
+FEW = Workcell(staging=Staging(slots=((0.3, 0.0, 0.0),)))
 
 
 def row(*xs: float) -> Stack:
@@ -34,9 +34,9 @@ def row(*xs: float) -> Stack:
 @pytest.mark.parametrize("lean", [-0.1, 0.0, 0.15])
 def test_a_block_waits_on_the_table_on_its_lowest_face(shape: int, lean: float) -> None:
     stack = stack_of([shape], [[0, 0, 0.5, 0, lean, 0.3]])
-    waiting = lay_out(stack, (0,), CELL, SIZE)[0]
+    waiting = lay_out(stack, (0,), WORKCELL, SIZE)[0]
     corners = stack.catalogue[shape].vertices * SIZE @ waiting.frame[:3, :3].T + waiting.frame[:3, 3]
-    slot = CELL.staging.slots[0]
+    slot = WORKCELL.staging.slots[0]
     assert corners[:, 2].min() == pytest.approx(0, abs=1e-12)
     assert np.count_nonzero(corners[:, 2] < 1e-9) >= 4  # a face, not an edge
     assert (corners.min(axis=0) + corners.max(axis=0))[:2] / 2 == pytest.approx(slot[:2])
@@ -45,34 +45,34 @@ def test_a_block_waits_on_the_table_on_its_lowest_face(shape: int, lean: float) 
 
 def test_a_plank_on_its_end_waits_on_its_end() -> None:
     stack = stack_of([1], [[0, 0, 1.0, 0, math.pi / 2, 0]])
-    assert lay_out(stack, (0,), CELL, SIZE)[0].top == pytest.approx(2 * SIZE)
+    assert lay_out(stack, (0,), WORKCELL, SIZE)[0].top == pytest.approx(2 * SIZE)
 
 
 def test_fingers_push_from_both_ends_to_the_middle_of_the_slot() -> None:
-    waiting = lay_out(stack_of([1], [[0, 0, 0.5, 0, 0, 0]]), (0,), CELL, SIZE)[0]
-    slot = np.array(CELL.staging.slots[0][:2])
+    waiting = lay_out(stack_of([1], [[0, 0, 0.5, 0, 0, 0]]), (0,), WORKCELL, SIZE)[0]
+    slot = np.array(WORKCELL.staging.slots[0][:2])
     for side in (-1, 1):
-        beside, stop, away = (frame[:3, 3] for frame in push_path(waiting, side, CELL))
-        assert stop[0] - slot[0] == pytest.approx(side * (SIZE + CELL.jaws.pad_width / 2))
+        beside, stop, away = (frame[:3, 3] for frame in push_path(waiting, side, WORKCELL))
+        assert stop[0] - slot[0] == pytest.approx(side * (SIZE + WORKCELL.jaws.pad_width / 2))
         assert side * (beside[0] - stop[0]) > side * (away[0] - stop[0]) > 0
         assert beside[1:] == pytest.approx(stop[1:])
 
 
-def refused(stack: Stack, cell: Cell) -> str:
+def refused(stack: Stack, workcell: Workcell) -> str:
     with pytest.raises(StackgenError) as error:
-        lay_out(stack, tuple(range(len(stack))), cell, SIZE)
+        lay_out(stack, tuple(range(len(stack))), workcell, SIZE)
     assert "\n" not in str(error.value)
     return str(error.value)
 
 
 def test_what_does_not_fit_is_refused() -> None:
-    narrow = Cell(jaws=replace(Jaws(), opening=0.06))
-    short = Cell(staging=replace(Staging(), length=0.15))
+    narrow = Workcell(jaws=replace(Jaws(), opening=0.06))
+    short = Workcell(staging=replace(Staging(), length=0.15))
     lying = stack_of([0], [[0, 0, 0.5, 0.8, 0, 0]])
     assert "wider than the jaws" in refused(row(0), narrow)
     assert "too small: 2 blocks, but 1 slots" in refused(row(0, 2), FEW)
     assert "too small: block 0 (rectangle)" in refused(stack_of([1], [[0, 0, 0.5, 0, 0, 0]]), short)
-    assert "leans more than 20 degrees" in refused(lying, CELL)
+    assert "leans more than 20 degrees" in refused(lying, WORKCELL)
 
 
 def gaps(stack: Stack) -> list[float]:
@@ -95,4 +95,4 @@ def test_blocks_one_on_the_other_are_left_alone() -> None:
 
 def test_every_shape_of_the_paper_fits_the_shipped_cell() -> None:
     poses = [[0, 0, 0.5, 0, 0, 0]] * len(PAPER_CATALOGUE)
-    assert len(lay_out(stack_of(range(len(PAPER_CATALOGUE)), poses), (0, 1, 2, 3), CELL, SIZE)) == 4
+    assert len(lay_out(stack_of(range(len(PAPER_CATALOGUE)), poses), (0, 1, 2, 3), WORKCELL, SIZE)) == 4

@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 
 from stackgen.robot.planning.plan import BuildPlan, plan_build
-from stackgen.robot.workcell import Cell, Staging
+from stackgen.robot.workcell import Staging, Workcell
 from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
 
-CELL = replace(Cell(), staging=Staging(straighten=False))
+WORKCELL = replace(Workcell(), staging=Staging(straighten=False))
 """Blocks are taken as they lie, so that plans are short."""
 
 TOWER = Stack(np.array([0, 3]), np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]]))
@@ -32,7 +32,7 @@ TOWER = Stack(np.array([0, 3]), np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0
 @cache
 def plan(placed: int = 0) -> BuildPlan:
     """Of the tower, some of whose blocks may stand already."""
-    return plan_build(TOWER, (0, 1), CELL, Physics(), "closed-form", placed=placed)
+    return plan_build(TOWER, (0, 1), WORKCELL, Physics(), solver="closed-form", placed=placed)
 
 
 @dataclass
@@ -70,7 +70,7 @@ def free_host() -> str:
 
 
 @contextmanager
-def stand_in(folder: Path, *options: str, joints: tuple[float, ...] = CELL.home) -> Iterator[StandIn]:
+def stand_in(folder: Path, *options: str, joints: tuple[float, ...] = WORKCELL.home) -> Iterator[StandIn]:
     """Start one, with the arm at some joint angles [deg]."""
     host, log = free_host(), folder / "standin.jsonl"
     command = [sys.executable, str(Path(__file__).with_name("standin.py")), "--host", host, "--log", str(log)]

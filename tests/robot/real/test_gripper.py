@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stackgen.errors import StackgenError
-from stackgen.robot.real.gripper import DigitalJaws, Gripper, Jaws, RobotiqJaws
+from stackgen.robot.real.gripper import DigitalJaws, Gripper, RealJaws, RobotiqJaws
 from tests.robot.real.arms import stand_in
 
 
@@ -57,7 +57,7 @@ def test_jaws_that_go_away_are_one_line(tmp_path: Path) -> None:
 @pytest.mark.parametrize("closed", [True, False])
 def test_digital_jaws_switch_their_output(closed: bool) -> None:
     switched: list[tuple[int, bool]] = []
-    jaws: Jaws = DigitalJaws(
+    jaws: RealJaws = DigitalJaws(
         Gripper(kind="digital", output=5, closed=closed, seconds=0.01), lambda *s: switched.append(s)
     )
     jaws.open(0.085)

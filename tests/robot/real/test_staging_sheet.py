@@ -11,7 +11,7 @@ from stackgen.errors import StackgenError
 from stackgen.robot.planning.staging import lay_out
 from stackgen.robot.real.staging_sheet import MARGIN, PAGE, area, places, tiles, write_staging_sheet
 from stackgen.stack import Stack
-from tests.robot.real.arms import CELL
+from tests.robot.real.arms import WORKCELL
 
 CUBE, RECTANGLE, LONG, TRIANGLE = range(4)
 SIZE = 0.05
@@ -24,7 +24,7 @@ def size(points: np.ndarray) -> np.ndarray:
 
 
 def test_outlines_have_the_blocks_sizes_and_lie_in_their_slots() -> None:
-    found = places(BLOCKS, ORDER, CELL, SIZE)
+    found = places(BLOCKS, ORDER, WORKCELL, SIZE)
     assert [(place.slot, place.block) for place in found] == list(enumerate(ORDER, 1))
     widths = {CUBE: 50, RECTANGLE: 100, LONG: 150, TRIANGLE: 50}
     for place in found:
@@ -35,15 +35,15 @@ def test_outlines_have_the_blocks_sizes_and_lie_in_their_slots() -> None:
 
 
 def test_outlines_lie_where_the_arm_fetches_the_blocks() -> None:
-    waiting = lay_out(BLOCKS, ORDER, CELL, SIZE)
-    for place in places(BLOCKS, ORDER, CELL, SIZE):
+    waiting = lay_out(BLOCKS, ORDER, WORKCELL, SIZE)
+    for place in places(BLOCKS, ORDER, WORKCELL, SIZE):
         x, y = 1e3 * waiting[place.block].grasp[:2, 3]
         low, high = place.outline.min(axis=0), place.outline.max(axis=0)
         assert low[0] < x < high[0] and low[1] < y < high[1]
 
 
 def test_every_slot_is_on_the_pages_and_the_pages_meet() -> None:
-    found = places(BLOCKS, ORDER, CELL, SIZE)
+    found = places(BLOCKS, ORDER, WORKCELL, SIZE)
     page = np.array(PAGE) - 2 * MARGIN
     corners = [corner for corner, _ in tiles(found)]
     low, _ = area(found)
@@ -57,9 +57,9 @@ def test_every_slot_is_on_the_pages_and_the_pages_meet() -> None:
 def test_the_svg_is_to_scale(tmp_path: Path) -> None:
     """The page is as large as its drawing and two margins, and so is the long block's outline in it."""
     path = tmp_path / "sheet.svg"
-    write_staging_sheet(path, BLOCKS, ORDER, CELL, SIZE)
+    write_staging_sheet(path, BLOCKS, order=ORDER, workcell=WORKCELL, cell_size=SIZE)
     root = ElementTree.parse(path).getroot()
-    low, high = area(places(BLOCKS, ORDER, CELL, SIZE))
+    low, high = area(places(BLOCKS, ORDER, WORKCELL, SIZE))
     points = [float(root.get(name, "").removesuffix("pt")) for name in ("width", "height")]
     np.testing.assert_allclose(np.array(points) * 25.4 / 72, high - low + 2 * MARGIN, rtol=1e-4)
     widths = []
@@ -71,17 +71,17 @@ def test_the_svg_is_to_scale(tmp_path: Path) -> None:
 
 
 def test_the_pdf_has_an_overview_and_pages_of_a4_and_is_the_same_twice(tmp_path: Path) -> None:
-    write_staging_sheet(tmp_path / "a.pdf", BLOCKS, ORDER, CELL, SIZE)
+    write_staging_sheet(tmp_path / "a.pdf", BLOCKS, order=ORDER, workcell=WORKCELL, cell_size=SIZE)
     data = (tmp_path / "a.pdf").read_bytes()
     boxes = re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", data)
     sizes = [tuple(round(float(n) * 25.4 / 72) for n in box) for box in boxes]
-    number = len(list(tiles(places(BLOCKS, ORDER, CELL, SIZE))))
+    number = len(list(tiles(places(BLOCKS, ORDER, WORKCELL, SIZE))))
     assert sorted(sizes) == sorted([(297, 210)] + [(210, 297)] * number)
-    write_staging_sheet(tmp_path / "b.pdf", BLOCKS, ORDER, CELL, SIZE)
+    write_staging_sheet(tmp_path / "b.pdf", BLOCKS, order=ORDER, workcell=WORKCELL, cell_size=SIZE)
     assert (tmp_path / "b.pdf").read_bytes() == data
 
 
 def test_another_suffix_is_refused(tmp_path: Path) -> None:
     with pytest.raises(StackgenError, match=r"\.pdf or \.svg"):
-        write_staging_sheet(tmp_path / "sheet.docx", BLOCKS, ORDER, CELL, SIZE)
+        write_staging_sheet(tmp_path / "sheet.docx", BLOCKS, order=ORDER, workcell=WORKCELL, cell_size=SIZE)
     assert not list(tmp_path.iterdir())

@@ -7,19 +7,18 @@ import numpy as np
 import pytest
 
 from stackgen.errors import StackgenError
-from stackgen.robot.backend import Close, Open
-from stackgen.robot.planning.motion import Motion, joint_motion
+from stackgen.robot.planning.motion import Close, Motion, Open, joint_motion
 from stackgen.robot.real.gripper import Gripper
 from stackgen.robot.real.program import Controller, controller_move, controller_pose, tool_offset
 from stackgen.robot.real.urscript import urscript
 from tests.robot.real import standin
-from tests.robot.real.arms import CELL, plan
+from tests.robot.real.arms import WORKCELL, plan
 
 NUMBERS = r"\[([^\]]*)\]"
 
 
 def program(**gripper: object) -> str:
-    return urscript(plan(), CELL, Controller(), Gripper(**gripper))  # type: ignore[arg-type]
+    return urscript(plan(), WORKCELL, Controller(), Gripper(**gripper))  # type: ignore[arg-type]
 
 
 def motions() -> list[Motion]:
@@ -29,9 +28,9 @@ def motions() -> list[Motion]:
 
 def test_the_controllers_base_is_the_urdfs_turned_by_half_a_turn() -> None:
     """Against the arm's published Denavit-Hartenberg table, which is written in the controller's base."""
-    random, tool = np.random.default_rng(0), np.array(tool_offset(CELL))
+    random, tool = np.random.default_rng(0), np.array(tool_offset(WORKCELL))
     for joints in random.uniform(-np.pi, np.pi, (20, 6)):
-        ours = standin.matrix(controller_pose(joints, CELL))
+        ours = standin.matrix(controller_pose(joints, WORKCELL))
         np.testing.assert_allclose(ours, standin.forward(joints, tool), atol=1e-7)
 
 
@@ -41,10 +40,12 @@ def test_every_motion_is_a_line_that_leads_to_its_end() -> None:
     for line, motion in zip(lines, motions(), strict=True):
         assert line.strip().startswith("movej(get_inverse_kin(p[" if motion.kind == "joint" else "movel(p[")
         pose = np.array([float(word) for word in re.findall(NUMBERS, line)[0].split(",")])
-        wanted = controller_pose(motion.end, CELL)
+        wanted = controller_pose(motion.end, WORKCELL)
         np.testing.assert_allclose(standin.matrix(pose), standin.matrix(wanted), atol=2e-6)
         speed = float(re.findall(r" v=([\d.]+)", line)[0])
-        assert 0 < speed <= (np.radians(CELL.speeds.joint) if motion.kind == "joint" else CELL.speeds.line) + 1e-3
+        assert (
+            0 < speed <= (np.radians(WORKCELL.speeds.joint) if motion.kind == "joint" else WORKCELL.speeds.line) + 1e-3
+        )
 
 
 def test_every_block_is_taken_let_go_and_named() -> None:
@@ -77,15 +78,15 @@ def test_a_digital_output_has_the_level_that_was_asked_for() -> None:
 
 def test_a_motion_out_of_the_workspace_is_refused_by_block_and_place() -> None:
     high = (0.55, 0.40, 0.12)
-    low_ceiling = replace(CELL, workspace=replace(CELL.workspace, high=high))
+    low_ceiling = replace(WORKCELL, workspace=replace(WORKCELL.workspace, high=high))
     with pytest.raises(StackgenError, match=r"block 0 \(cube\): .* outside cell.workspace"):
         urscript(plan(), low_ceiling, Controller(), Gripper())
 
 
 def test_a_motion_that_is_too_fast_is_refused() -> None:
-    motion = joint_motion("transit", CELL.home_joints, CELL.home_joints + 0.3, CELL.speeds)
+    motion = joint_motion("transit", WORKCELL.home_joints, WORKCELL.home_joints + 0.3, WORKCELL.speeds)
     assert motion is not None
-    slow = replace(CELL, speeds=replace(CELL.speeds, joint=10.0))
+    slow = replace(WORKCELL, speeds=replace(WORKCELL.speeds, joint=10.0))
     with pytest.raises(StackgenError, match="transit would be too fast"):
         controller_move(motion, slow)
-    assert controller_move(motion, CELL).speed <= np.radians(CELL.speeds.joint)
+    assert controller_move(motion, WORKCELL).speed <= np.radians(WORKCELL.speeds.joint)

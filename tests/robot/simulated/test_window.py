@@ -9,7 +9,7 @@ from stackgen.robot.planning.clearance import ArmIndices
 from stackgen.robot.planning.motion import joint_motion
 from stackgen.robot.simulated.arm import Floats, SimulatedArm
 from stackgen.robot.simulated.window import Window
-from stackgen.robot.workcell import Cell
+from stackgen.robot.workcell import Workcell
 from stackgen.sim.physics import Physics
 from stackgen.sim.simulator import bullet
 from stackgen.stack import Stack
@@ -20,13 +20,13 @@ STACK = Stack(np.array([0, 3]), np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0
 def arm() -> SimulatedArm:
     frames = [np.eye(4), np.eye(4)]
     frames[0][:3, 3], frames[1][:3, 3] = (0.2, 0, 0.05), (-0.2, 0, 0.08)  # they fall
-    return SimulatedArm(Cell(), STACK, frames, Physics())
+    return SimulatedArm(Workcell(), STACK, frames, Physics())
 
 
 def moved(simulated: SimulatedArm) -> list[Floats]:
     """Where everything is after a short motion."""
-    home = simulated.cell.home_joints
-    motion = joint_motion("transit", home, home + 0.05, simulated.cell.speeds)
+    home = simulated.workcell.home_joints
+    motion = joint_motion("transit", home, home + 0.05, simulated.workcell.speeds)
     assert motion is not None
     simulated.move(motion)
     places = [np.array(simulated.frame(block)) for block in range(len(STACK))]

@@ -1,4 +1,4 @@
-"""What became of a build: errors of each block, contacts that were not planned, and whether it stands."""
+"""The report of a build: errors of each block, contacts that were not planned, and whether the result stands."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.io.stacks_file import Entry, StacksFile, to_json
+from stackgen.io.stacks_file import StackEntry, entry_to_json
 from stackgen.stack import Stack
 
 Floats = NDArray[np.float64]
@@ -21,10 +21,10 @@ class PlacementError:
     """How far a block is from where it should be.
 
     Args:
-        xy: Along the table [mm].
-        z: Upwards [mm].
-        yaw: About the vertical [deg], without its sign.
-        tilt: Of its vertical axis [deg].
+        xy: Distance along the table [mm].
+        z: Height above the place [mm].
+        yaw: Turn about the vertical [deg], without its sign.
+        tilt: Turn of its vertical axis [deg].
     """
 
     xy: float
@@ -34,7 +34,7 @@ class PlacementError:
 
     @staticmethod
     def between(frame: Floats, goal: Floats) -> PlacementError:
-        """Of a frame (4, 4) from its goal [m].
+        """Measure a frame (4, 4) against its goal (4, 4) [m].
 
         >>> moved = np.eye(4)
         >>> moved[:3, 3] = 0.003, 0.004, 0.001
@@ -49,22 +49,22 @@ class PlacementError:
         return PlacementError(*(round(float(value), 9) + 0.0 for value in values))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BlockReport:
-    """What became of a block.
+    """The report of one block.
 
     Args:
-        block: Its number in the stack.
-        shape: Its name.
-        slot_error: Of the slot it was fetched from: how far it lay from where the robot believed.
-        released: When the jaws had let go.
-        settled: At the end of the build.
-        disturbed: How far later blocks moved it [mm].
-        clearance: The least that was planned for arm, jaws and the block itself [mm].
-        nearest: To what.
-        ik_distance: Largest residual of the inverse kinematics [mm].
-        ik_turn: Likewise [deg].
-        seconds: Simulated time that it took.
+        block: Number of the block in the stack.
+        shape: Name of its shape.
+        slot_error: Error of its place in the slot, against where the robot believed it to be.
+        released: Error when the jaws had let go.
+        settled: Error at the end of the build.
+        disturbed: Distance by which later blocks moved it [mm].
+        clearance: Least planned distance of arm, jaws and the block itself from anything else [mm].
+        nearest: The two things at that distance.
+        ik_distance: Largest distance that the inverse kinematics left [mm].
+        ik_turn: Largest turn that the inverse kinematics left [deg].
+        seconds: Simulated time that it took [s].
         unplanned: Contacts that should not have been, in words.
     """
 
@@ -82,27 +82,27 @@ class BlockReport:
     unplanned: tuple[str, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BuildReport:
-    """What became of a build.
+    """The report of a build.
 
     Args:
-        blocks: In the order in which they were placed.
-        order: Its strategy.
+        blocks: Reports of the blocks, in the order in which they were placed.
+        order: Strategy of the order.
         safe: Whether every state on the way stands by itself.
         least_margin: Largest tilt that the least stable state survives [deg].
         grasp: `jaws` or `fixed`.
-        built: Every block is within half a cell of its place.
-        stands: No block falls when the built stack is simulated awake in a fresh world.
-        iou_target: Of the built silhouette with the target (0 if it does not stand); None without a target.
-        iou_generated: Of the built silhouette with that of the stack as it was generated and settled.
-        generated_iou_target: Of the generated stack, settled, with the target.
-        seconds: Simulated time from start to end.
+        built: Whether every block is within half a cell of its place.
+        stands: Whether no block falls when the built stack is simulated awake in a fresh world.
+        iou_target: IoU of the built silhouette with the target (0 if it does not stand); None without a target.
+        iou_generated: IoU of the built silhouette with that of the stack as it was generated and settled.
+        generated_iou_target: IoU of the generated stack, settled, with the target.
+        seconds: Simulated time from start to end [s].
         real_time_factor: Simulated seconds in a second.
         tracking_error: Largest difference of a joint from where it should have been [deg].
-        torque: Largest of each joint [N m].
-        stack: As it was built.
-        design: As it should have been built.
+        torque: Largest torque of each joint [N m].
+        stack: Blocks as they were built.
+        design: Blocks as they should have been built.
     """
 
     blocks: tuple[BlockReport, ...]
@@ -124,7 +124,7 @@ class BuildReport:
 
     @property
     def success(self) -> bool:
-        """Built and standing."""
+        """Whether it is built and stands."""
         return self.built and self.stands
 
     @property
@@ -133,19 +133,18 @@ class BuildReport:
         return tuple(contact for block in self.blocks for contact in block.unplanned)
 
     def errors(self, key: str, when: str = "settled") -> Floats:
-        """(k,) one of the placement errors, without its sign: `xy`, `z`, `yaw`, `tilt`; `released` or `settled`."""
+        """One of the placement errors (k,), without its sign: `xy`, `z`, `yaw`, `tilt`; `released` or `settled`."""
         return np.abs([getattr(getattr(block, when), key) for block in self.blocks])
 
     def to_json(self) -> dict[str, Any]:
         """Plain form; the stacks as `stacks.json` has them."""
         plain = {k: v for k, v in vars(self).items() if k not in ("stack", "design", "blocks")}
-        stacks = to_json(StacksFile((Entry(self.stack), Entry(self.design)), self.stack.catalogue))["stacks"]
         return {
             "format": FORMAT,
             **plain,
             "success": self.success,
             "unplanned_contacts": len(self.unplanned),
             "blocks": [asdict(block) for block in self.blocks],
-            "stack": stacks[0],
-            "design": stacks[1],
+            "stack": entry_to_json(StackEntry(self.stack)),
+            "design": entry_to_json(StackEntry(self.design)),
         }

@@ -1,4 +1,4 @@
-"""How far a build with a real arm has got, on disk after every block, so that it can go on after a stop."""
+"""The progress of a build with a real arm, on disk after every block, so that it can be resumed after a stop."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import Any, Literal
 import numpy as np
 
 from stackgen.errors import StackgenError
-from stackgen.io.files import write_atomically
-from stackgen.robot.workcell import Cell
+from stackgen.io.files import write_json
+from stackgen.robot.workcell import Workcell
 from stackgen.stack import Stack
 
 FORMAT = "stackgen.build/1"
@@ -20,21 +20,21 @@ FILE = "progress.json"
 Status = Literal["building", "stopped", "done"]
 
 _SAME = 0.01  # poses that differ by less are the same [cell, rad]
-_MAY_CHANGE = ("speeds",)  # parts of the cell that do not change where blocks are
+_MAY_CHANGE = ("speeds",)  # parts of the workcell that do not change where blocks are
 
 
 @dataclass(frozen=True)
-class Progress:
-    """What stands already.
+class BuildProgress:
+    """What stands already; its fields are the keys of the file.
 
     Args:
         shapes: (k,) names of the blocks.
-        poses: (k, 6) where they are to be [cell, rad].
-        order: (k,) of placing.
-        cell: Where it is built, in plain form.
-        placed: How many of the order stand.
-        status: Whether the build goes on, was stopped, or is done.
-        why: It was stopped.
+        poses: (k, 6) poses in which they are to be [cell, rad].
+        order: (k,) numbers of the blocks in the order of placing.
+        cell: Workcell in which it is built, in plain form.
+        placed: Number of blocks of the order that stand.
+        status: Whether the build is under way, was stopped, or is done.
+        why: Reason for which it was stopped.
     """
 
     shapes: tuple[str, ...]
@@ -46,15 +46,15 @@ class Progress:
     why: str | None = None
 
     @staticmethod
-    def of(stack: Stack, order: tuple[int, ...], cell: Cell) -> Progress:
-        """A build of which nothing stands yet."""
+    def of(stack: Stack, order: tuple[int, ...], workcell: Workcell) -> BuildProgress:
+        """Begin a build of which nothing stands yet."""
         poses = tuple(tuple(float(number) for number in pose) for pose in stack.poses)
-        plain = json.loads(json.dumps(cell.to_json()))  # lists for tuples, as when read back
-        return Progress(tuple(stack.names), poses, tuple(order), plain)
+        plain = json.loads(json.dumps(workcell.to_json()))  # lists for tuples, as when read back
+        return BuildProgress(tuple(stack.names), poses, tuple(order), plain)
 
     @staticmethod
-    def read(folder: Path) -> Progress:
-        """From the folder of a build.
+    def read(folder: Path) -> BuildProgress:
+        """Read the file in the folder of a build.
 
         Raises:
             StackgenError: If there is none, or it is no such file.
@@ -66,7 +66,7 @@ class Progress:
             plain = json.loads(path.read_text())
             if plain.pop("format") != FORMAT:
                 raise ValueError("format")
-            found = Progress(**plain)
+            found = BuildProgress(**plain)
             found = replace(
                 found,
                 shapes=tuple(found.shapes),
@@ -81,34 +81,34 @@ class Progress:
         return found
 
     def write(self, folder: Path) -> None:
-        """Into the folder of a build, at once or not at all."""
+        """Write the file into the folder of a build, whole or not at all."""
         plain = {"format": FORMAT, **vars(self)}
-        write_atomically(folder / FILE, (json.dumps(plain, indent=1, allow_nan=False) + "\n").encode())
+        write_json(folder / FILE, plain)
 
     @property
     def next(self) -> int | None:
-        """The block to be placed next."""
+        """Number of the block to be placed next; None when all stand."""
         return self.order[self.placed] if self.placed < len(self.order) else None
 
-    def require_same(self, stack: Stack, order: tuple[int, ...], cell: Cell) -> None:
+    def require_same(self, stack: Stack, order: tuple[int, ...], workcell: Workcell) -> None:
         """See that a plan is that of this build.
 
         Raises:
-            StackgenError: If blocks, places, order or cell are others.
+            StackgenError: If blocks, places, order or workcell are others.
         """
-        now = Progress.of(stack, order, cell)
+        now = BuildProgress.of(stack, order, workcell)
         if now.shapes != self.shapes or not np.allclose(now.poses, self.poses, atol=_SAME):
             raise StackgenError("--resume: the build that was interrupted was of another structure")
         if now.order != self.order:
             raise StackgenError("--resume: the build that was interrupted had another order; name the same --order")
-        for name in sorted(set(self.cell) | set(now.cell)):
+        for name in sorted(self.cell):
             if name not in _MAY_CHANGE and self.cell.get(name) != now.cell.get(name):
                 raise StackgenError(f"--resume: cell.{name} is not what it was when the build was interrupted")
 
     def describe(self) -> str:
-        """In a line.
+        """Describe it in a line.
 
-        >>> Progress(("cube", "cube"), (), (1, 0), {}, placed=1).describe()
+        >>> BuildProgress(("cube", "cube"), (), (1, 0), {}, placed=1).describe()
         '1 of 2 blocks stand (1); next is block 0 (cube)'
         """
         count = f"{self.placed} of {len(self.order)} blocks stand"

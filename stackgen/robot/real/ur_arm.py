@@ -20,14 +20,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from stackgen.errors import StackgenError
+from stackgen.errors import StackgenError, require
 from stackgen.robot.backend import ArmState
 from stackgen.robot.planning.motion import Motion
 from stackgen.robot.planning.plan import BlockPlan
-from stackgen.robot.real.dashboard import require_ready
-from stackgen.robot.real.gripper import DigitalJaws, Gripper, Jaws, RobotiqJaws
+from stackgen.robot.real.gripper import DigitalJaws, Gripper, RealJaws, RobotiqJaws
 from stackgen.robot.real.program import Controller, Grasps, Move, controller_move, controller_pose, tool_offset
-from stackgen.robot.workcell import Cell
+from stackgen.robot.real.readiness import require_ready
+from stackgen.robot.workcell import Workcell
 
 Floats = NDArray[np.float64]
 
@@ -61,26 +61,26 @@ class ArmStopped(StackgenError):
 
 
 class UrArm:
-    """A UR5 with jaws. As a context: the program on the controller is ended and the connections are closed.
+    """A UR arm with jaws; on leaving the context its program is ended and the connections are closed.
 
     Args:
-        host: Of its controller.
-        cell: Its limits, tool and home position.
-        controller: Payload and tolerances.
-        gripper: How the jaws are driven.
+        host: Address of its controller.
+        workcell: Limits, tool and home position of the arm.
+        controller: Payload of the tool, and tolerances.
+        gripper: Settings of the jaws.
 
     Raises:
-        StackgenError: If there is no controller, it is not ready, the arm is not at home, or it is not a UR5 with
-            the cell's tool. Nothing has moved then.
+        StackgenError: If there is no controller, it is not ready, the arm is not at home, or it is not the
+            workcell's arm with the workcell's tool. Nothing has moved then.
     """
 
-    def __init__(self, host: str, cell: Cell, controller: Controller, gripper: Gripper) -> None:
-        self.host, self.cell, self.controller, self.gripper = host, cell, controller, gripper
-        control, receive = _client()
+    def __init__(self, host: str, workcell: Workcell, controller: Controller, gripper: Gripper) -> None:
+        self.host, self.workcell, self.controller, self.gripper = host, workcell, controller, gripper
+        control, receive = require("rtde_control", "ur"), require("rtde_receive", "ur")
         require_ready(host)
         _require_port(host, PORT)
         self._control: Any = None
-        self._jaws: Jaws | None = None
+        self._jaws: RealJaws | None = None
         self._stopped: str | None = None
         self._grasps = Grasps()
         self._fed = 0.0
@@ -103,9 +103,9 @@ class UrArm:
 
         Raises:
             ArmStopped: If the arm stops on the way, or the connection is lost.
-            StackgenError: If the motion is not within the cell's limits, or starts elsewhere; nothing moves then.
+            StackgenError: If the motion is not within the workcell's limits, or starts elsewhere; nothing moves then.
         """
-        move = controller_move(motion, self.cell)
+        move = controller_move(motion, self.workcell)
         self._check()
         away = float(np.abs(self._joints() - motion.positions[0]).max())
         if away > _AT_START:
@@ -118,7 +118,7 @@ class UrArm:
         self._follow(move)
 
     def begin(self, step: BlockPlan) -> None:
-        """A block is begun: the last closing of its plan must take hold of it."""
+        """Note that a block is begun: the last closing of its plan must take hold of it."""
         self._grasps.begin(step)
 
     def open(self, width: float) -> None:
@@ -141,11 +141,11 @@ class UrArm:
                 raise StackgenError("the jaws closed on nothing: is the block in its slot?")
 
     def opening(self) -> float | None:
-        """Between the pads [m]; None where the jaws cannot tell."""
+        """Distance between the pads [m]; None where the jaws cannot tell."""
         return self._hands.opening()
 
     def state(self) -> ArmState:
-        """Where it stands, and why if it does not move on."""
+        """Tell where it stands, and why if it does not move on."""
         opening = None if self._jaws is None or self._stopped else self.opening()
         return ArmState(self._joints(), np.nan if opening is None else opening, self._stopped)
 
@@ -157,13 +157,9 @@ class UrArm:
             self._control.stopJ(_BRAKING)
             self._control.stopScript()
 
-    # The rest is how.
-
-    def _connect_jaws(self) -> Jaws:
+    def _connect_jaws(self) -> RealJaws:
         if self.gripper.kind == "digital":
-            import rtde_io
-
-            outputs = rtde_io.RTDEIOInterface(self.host)
+            outputs = require("rtde_io", "ur").RTDEIOInterface(self.host)
 
             def set_output(number: int, level: bool) -> None:
                 if not outputs.setStandardDigitalOut(number, level):
@@ -176,10 +172,10 @@ class UrArm:
 
     def _require_home(self) -> None:
         self._wait_for_state()
-        away = np.degrees(np.abs(self._joints() - self.cell.home_joints))
+        away = np.degrees(np.abs(self._joints() - self.workcell.home_joints))
         worst = int(np.argmax(away))
         if away[worst] > self.controller.near_home:
-            home = ", ".join(f"{angle:g}" for angle in self.cell.home)
+            home = ", ".join(f"{angle:g}" for angle in self.workcell.home)
             raise StackgenError(
                 f"the arm is not at its home position (joint {worst + 1} is {away[worst]:.0f} degrees away): bring it"
                 f" to {home} degrees at the pendant; the way there from elsewhere is not checked for collisions"
@@ -192,7 +188,7 @@ class UrArm:
                 self.host, -1.0, control.RTDEControlInterface.FLAG_UPLOAD_SCRIPT
             )
             fine = (
-                self._control.setTcp(list(tool_offset(self.cell)))
+                self._control.setTcp(list(tool_offset(self.workcell)))
                 and self._control.setPayload(self.controller.payload, list(self.controller.center_of_gravity))
                 and self._control.setWatchdog(_HUNGER)
             )
@@ -206,14 +202,14 @@ class UrArm:
         end = time.monotonic() + 2.0
         while True:
             self._check()
-            expected = controller_pose(self._joints(), self.cell)
+            expected = controller_pose(self._joints(), self.workcell)
             distance, turn = difference(self._pose(), expected)
             if distance <= self.controller.agreement and turn <= 3 * self.controller.agreement:
                 return
             if time.monotonic() > end:  # the new tool takes a moment to be seen
                 raise StackgenError(
-                    f"the controller at {self.host} has the finger tips {distance * 1e3:.0f} mm from where a UR5 with"
-                    " the cell's jaws has them: is it a UR5, mounted upright, and are cell.jaws right?"
+                    f"the controller at {self.host} has the finger tips {distance * 1e3:.0f} mm from where the URDF"
+                    " has them: is it the arm of cell.arm, mounted upright, and are cell.jaws right?"
                 )
             time.sleep(_LOOK)
 
@@ -245,13 +241,13 @@ class UrArm:
             time.sleep(_LOOK)
 
     @property
-    def _hands(self) -> Jaws:
+    def _hands(self) -> RealJaws:
         assert self._jaws is not None, "connected as long as the arm is"
         return self._jaws
 
     @contextlib.contextmanager
     def _blamed(self) -> Iterator[None]:
-        """What goes wrong with the jaws stops the arm."""
+        """Stop the arm for what goes wrong with the jaws."""
         try:
             yield
         except ArmStopped:
@@ -338,7 +334,7 @@ def difference(a: Floats, b: Floats) -> tuple[float, float]:
 
 @contextlib.contextmanager
 def client_messages(file: Path) -> Iterator[None]:
-    """Have what the client's own threads print land in a file: an error is one line of ours.
+    """Send what the client's own threads print to a file: an error is one line of ours.
 
     Python's own output stays where it was.
     """
@@ -368,17 +364,8 @@ def _descriptor(stream: Any) -> int | None:
         return None
 
 
-def _client() -> tuple[Any, Any]:
-    try:
-        import rtde_control
-        import rtde_receive
-    except ImportError as error:
-        raise StackgenError("--arm ur-rtde needs the client of the arm: pip install 'stackgen[ur]'") from error
-    return rtde_control, rtde_receive
-
-
 def _require_port(host: str, port: int) -> None:
-    """The client itself would wait for minutes."""
+    """See that a port is open: the client itself would wait for minutes."""
     try:
         socket.create_connection((host, port), timeout=3.0).close()
     except OSError as error:

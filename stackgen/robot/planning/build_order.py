@@ -6,7 +6,8 @@ next. Of all orders that pass, the one is taken whose least stable state is the 
 sets (Dijkstra, with a minimum in the place of the sum). The paper places greedily, left to right and bottom up
 ("Block Stacking in the Real World"), and never asks.
 
-Lengths in cells, margins in degrees. A set of blocks is an integer whose bit i says whether block i is in it.
+A step that no order can avoid and that does not stand by itself needs a temporary support (assembly planning's third
+hand). Lengths in cells, margins in degrees. A set of blocks is an integer whose bit i says whether block i is in it.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import block_vertices, centers_of_mass, row_intervals
 from stackgen.protocols import StabilityChecker
 from stackgen.robot.workcell import Jaws
-from stackgen.sim.statics.checker import EquilibriumChecker
+from stackgen.sim.statics.checker import StaticsChecker
 from stackgen.stack import Stack
 
 Floats = NDArray[np.float64]
@@ -34,7 +35,7 @@ Approach = Callable[[Stack, tuple[int, ...], int], bool]
 """(stack, blocks placed before, block) -> whether the gripper gets the block to its place and away again."""
 
 BESIDE = 0.005
-"""Blocks that overlap sideways by less than this stand side by side, but for rounding [cell]: whoever lies over
+"""Blocks that overlap sideways by less than this stand side by side, but for rounding [cell]: a block that lies over
 another's end by half a millimetre is in its way from above."""
 
 BELOW = 0.3
@@ -54,10 +55,10 @@ class BuildOrder:
 
     Args:
         blocks: Indices of the blocks, the first to place first.
-        margins: Of the states after each of them: largest tilt of the ground that it survives [deg].
-        safe: Every state stands, and every block can be brought to its place.
-        blocked: Where it is not safe, a sentence that names the first step that needs a third hand.
-        checks: How many sets of blocks were judged.
+        margins: Largest tilt of the ground that the state after each of them survives [deg].
+        safe: Whether every state stands, and every block can be brought to its place.
+        blocked: Where it is not safe, a sentence that names the first step that needs a temporary support.
+        checks: Number of sets of blocks that were checked.
 
     >>> BuildOrder((1, 0), (26.6, 18.4), safe=True).least_margin
     18.4
@@ -71,7 +72,7 @@ class BuildOrder:
 
     @property
     def least_margin(self) -> float:
-        """Of the least stable state [deg]."""
+        """Margin of the least stable state [deg]."""
         return min(self.margins, default=90.0)
 
 
@@ -82,19 +83,19 @@ def plan_order(
     approach: Approach | None = None,
     strategy: Strategy = "safest",
 ) -> BuildOrder:
-    """The order in which to place the blocks of a stack.
+    """Find the order in which to place the blocks of a stack.
 
     The poses should be those in which the stack rests, `Verdict.settled`: blocks that float or overlap as a
     sampler left them are in each other's way.
 
     Args:
-        stack: As it is to stand in the end.
-        checker: Says which states stand; statics by default. The margins are those of statics in any case.
-        approach: Says which blocks can be brought to their places; :class:`TopDownJaws` by default.
-        strategy: `safest`, or `greedy`: the paper's order, judged alike, but not changed.
+        stack: Stack as it is to stand in the end.
+        checker: Checker that says which states stand; statics by default. The margins always come from statics.
+        approach: Function that says which blocks can be brought to their places; :class:`TopDownJaws` by default.
+        strategy: `safest`, or `greedy`: the paper's order, checked in the same way, but not changed.
 
     Returns:
-        An order of all blocks. If no order is safe, one with as few steps as possible that need a third hand.
+        An order of all blocks. If no order is safe, one with as few steps as possible that need a temporary support.
 
     Raises:
         StackgenError: If there is no such strategy.
@@ -103,18 +104,18 @@ def plan_order(
     >>> plan_order(Stack([0, 0], [high, low])).blocks
     (1, 0)
     """
-    judge = _Judge(stack, checker, approach or TopDownJaws())
+    checks = _StateChecks(stack, checker, approach or TopDownJaws())
     if strategy not in ("safest", "greedy"):
         raise StackgenError(f"order: there are safest and greedy, got {strategy!r}")
-    blocks = greedy_order(stack) if strategy == "greedy" else _safest(stack, judge)
+    blocks = greedy_order(stack) if strategy == "greedy" else _safest(stack, checks)
     sets = list(_growing(blocks))
-    margins = tuple(judge.state(after).margin for _, after in sets)
-    blocked = next(filter(None, (judge.trouble(step, *sets[step], blocks[step]) for step in range(len(sets)))), None)
-    return BuildOrder(blocks, margins, blocked is None, blocked, len(judge.states))
+    margins = tuple(checks.state(after).margin for _, after in sets)
+    blocked = next(filter(None, (checks.trouble(step, *sets[step], blocks[step]) for step in range(len(sets)))), None)
+    return BuildOrder(blocks, margins, blocked is None, blocked, len(checks.states))
 
 
 def greedy_order(stack: Stack) -> tuple[int, ...]:
-    """The paper's order: layer by layer from the ground, each from left to right.
+    """Order the blocks as the paper does: layer by layer from the ground, each from left to right.
 
     >>> greedy_order(Stack([0, 0, 0], [[0.5, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0], [-0.5, 0, 0.5, 0, 0, 0]]))
     (2, 0, 1)
@@ -125,39 +126,39 @@ def greedy_order(stack: Stack) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class _State:
-    """What a set of blocks is worth: whether it stands, its margin [deg], and who goes if it does not."""
+    """Whether a set of blocks stands, its margin [deg], and which blocks fall if it does not."""
 
     stands: bool
     margin: float
     falling: NDArray[np.bool_]
 
 
-class _Judge:
+class _StateChecks:
     """Answers about sets of blocks of one stack, each found once."""
 
     def __init__(self, stack: Stack, checker: StabilityChecker | None, approach: Approach) -> None:
         self.stack = stack
-        self.statics = checker if isinstance(checker, EquilibriumChecker) else EquilibriumChecker()
+        self.statics = checker if isinstance(checker, StaticsChecker) else StaticsChecker()
         self.checker = checker or self.statics
         self.approach = approach
         self.states: dict[int, _State] = {}
         self.free: dict[tuple[int, int], bool] = {}
 
     def state(self, members: int) -> _State:
-        """Whether these blocks stand without the others."""
+        """Check whether these blocks stand without the others."""
         if members not in self.states:
-            self.states[members] = self._judged(self._part(members))
+            self.states[members] = self._checked(self._part(members))
         return self.states[members]
 
     def reachable(self, before: int, block: int) -> bool:
-        """Whether the block can be brought to its place when these blocks are there."""
+        """Check whether the block can be brought to its place when these blocks are there."""
         if (before, block) not in self.free:
             self.free[before, block] = self.approach(self.stack, _members(before), block)
         return self.free[before, block]
 
     def trouble(self, step: int, before: int, after: int, block: int) -> str | None:
-        """Why a step needs a third hand, None where it does not."""
-        what = f"step {step + 1} of {len(self.stack)} needs a third hand"
+        """Say why a step needs a temporary support, None where it does not."""
+        what = f"step {step + 1} of {len(self.stack)} needs a temporary support"
         if not self.reachable(before, block):
             return f"{what}: {self._in_the_way(before, block)}"
         if self.state(after).stands:
@@ -165,7 +166,7 @@ class _Judge:
         return f"{what}: once {self._called(block)} is placed, {self._falls(after, block)}"
 
     def _in_the_way(self, before: int, block: int) -> str:
-        """Which blocks are in the way of one, and what would fall if they came after it."""
+        """Say which blocks are in the way of one, and what would fall if they came after it."""
         alone = [other for other in _members(before) if not self.reachable(1 << other, block)]
         others = alone or list(_members(before))
         if not others:
@@ -178,18 +179,18 @@ class _Judge:
         return f"{sentence}, and without {'it' if len(others) == 1 else 'them'} {self._falls(without, block)}"
 
     def _falls(self, members: int, block: int) -> str:
-        """Which of these blocks would not hold, and why; `block` where the judge names none."""
+        """Say which of these blocks would not hold, and why; `block` where the checker names none."""
         here, part = _members(members), self._part(members)
-        reasons = self.statics.reasons(part, self.statics.equilibrium(part))
+        reasons = self.statics.reasons(part, self.statics.answer(part))
         falling = list(reasons) or np.flatnonzero(self.state(members).falling).tolist() or [here.index(block)]
         first = min(falling, key=lambda i: part.poses[i, 2])  # what lies higher may only lose its support
         return f"{self._called(here[first])} would not hold ({reasons.get(first, 'falls in the simulator')})"
 
-    def _judged(self, part: Stack) -> _State:
+    def _checked(self, part: Stack) -> _State:
         verdict = self.checker.check(part)
         moved = np.linalg.norm(verdict.settled.poses[:, :3] - part.poses[:, :3], axis=1)
         falling = verdict.fell | (moved > STILL)
-        margin = verdict.margin if verdict.margin is not None else self.statics.equilibrium(part).margin
+        margin = verdict.margin if verdict.margin is not None else self.statics.answer(part).margin
         return _State(verdict.stable and not falling.any(), math.degrees(margin), falling)
 
     def _part(self, members: int) -> Stack:
@@ -200,15 +201,15 @@ class _Judge:
         return f"block {block} ({self.stack.names[block]})"
 
 
-def _safest(stack: Stack, judge: _Judge) -> tuple[int, ...]:
-    """The order with the fewest unsafe steps, of those the one with the largest least margin.
+def _safest(stack: Stack, checks: _StateChecks) -> tuple[int, ...]:
+    """Find the order with the fewest unsafe steps, of those the one with the largest least margin.
 
     Both only grow worse as blocks are taken away, so whatever leaves the queue first was reached in the best way.
     Of equals the deepest set goes first, then the one whose last removed block is the last of the paper's order.
     """
     rank = {block: place for place, block in enumerate(greedy_order(stack))}
     everything = (1 << len(stack)) - 1
-    queue: list[_Entry] = [_Entry(0, -math.inf, len(stack), 0, everything, ())]
+    queue: list[_Queued] = [_Queued(0, -math.inf, len(stack), 0, everything, ())]
     done: set[int] = set()
     opened = [0] * (len(stack) + 1)
     while queue:
@@ -219,29 +220,29 @@ def _safest(stack: Stack, judge: _Judge) -> tuple[int, ...]:
             return entry.placed_after
         done.add(entry.members)
         opened[entry.size] += 1
-        state = judge.state(entry.members)
+        state = checks.state(entry.members)
         for block in _members(entry.members):
             before = entry.members & ~(1 << block)
-            unsafe = entry.unsafe + (not judge.reachable(before, block))
+            unsafe = entry.unsafe + (not checks.reachable(before, block))
             least = max(entry.least, -state.margin)
             if before and before not in done:
-                below = judge.state(before)
+                below = checks.state(before)
                 unsafe, least = unsafe + (not below.stands), max(least, -below.margin)
             order = (block, *entry.placed_after)
-            heapq.heappush(queue, _Entry(unsafe, least, entry.size - 1, -rank[block], before, order))
+            heapq.heappush(queue, _Queued(unsafe, least, entry.size - 1, -rank[block], before, order))
     return greedy_order(stack)  # only of an empty stack
 
 
 @dataclass(frozen=True, order=True)
-class _Entry:
+class _Queued:
     """A set of blocks in the queue, the best first.
 
     Args:
-        unsafe: Steps from here on that need a third hand.
+        unsafe: Number of steps from here on that need a temporary support.
         least: Minus the least margin from here on [deg].
         size: Number of blocks.
         late: Minus the place of the block taken last in the paper's order.
-        members: The set.
+        members: The set of blocks.
         placed_after: The blocks that are not in it, in their order.
     """
 
@@ -258,7 +259,7 @@ def _members(blocks: int) -> tuple[int, ...]:
 
 
 def _growing(blocks: tuple[int, ...]) -> Iterator[tuple[int, int]]:
-    """The sets before and after each block of an order."""
+    """Yield the sets before and after each block of an order."""
     before = 0
     for block in blocks:
         after = before | 1 << block
@@ -274,9 +275,9 @@ class TopDownJaws:
     open fingers and the palm go. It is the box test of :class:`~stackgen.robot.workcell.Jaws`; the arm is not in it.
 
     Args:
-        jaws: Their extents [m].
+        jaws: Extents of the jaws [m].
         cell_size: Edge of a cube [m].
-        clearance: Of fingers and palm from everything else [m].
+        clearance: Least distance of fingers and palm from everything else [m].
 
     >>> deep, beside = [0, 0, 0.5, 0, 0, 0], [[x, 0, z, 0, 0, 0] for x in (-1, 1) for z in (0.5, 1.5)]
     >>> TopDownJaws()(Stack([0] * 5, [deep, *beside]), (1, 2, 3, 4), 0)  # the palm is wider than the hole
@@ -288,7 +289,7 @@ class TopDownJaws:
     clearance: float = 0.002
 
     def __call__(self, stack: Stack, placed: tuple[int, ...], block: int) -> bool:
-        """Whether the way of `block` is free of the blocks `placed`."""
+        """Check whether the way of `block` is free of the blocks `placed`."""
         corners = block_vertices(stack)
         boxes = self._boxes(centers_of_mass(stack)[block], corners[block])
         return not any(
@@ -297,11 +298,11 @@ class TopDownJaws:
         )
 
     def _boxes(self, center: Floats, corners: Floats) -> list[tuple[Floats, Floats]]:
-        """Lower and upper corner of what fingers and palm sweep on their way up [cell].
+        """Find lower and upper corner of what fingers and palm sweep on their way up [cell].
 
         Args:
             center: (3,) centre of mass of the block, over which they come down.
-            corners: (V, 3) of the block.
+            corners: (V, 3) corners of the block.
         """
         jaws, scale = self.jaws, 1 / self.cell_size
         room = self.clearance * scale
@@ -320,7 +321,7 @@ class TopDownJaws:
 
 
 def _covers(other: Floats, block: Floats) -> bool:
-    """Whether part of a placed block (V, 3) is above the underside of the block that is lowered (V, 3)."""
+    """Check whether part of a placed block (V, 3) is above the underside of the block that is lowered (V, 3)."""
     low = np.maximum(other.min(axis=0), block.min(axis=0))
     high = np.minimum(other.max(axis=0), block.max(axis=0))
     if (high - low)[:2].min() <= BESIDE:
@@ -333,6 +334,6 @@ def _covers(other: Floats, block: Floats) -> bool:
 
 
 def _above(corners: Floats, box: tuple[Floats, Floats]) -> bool:
-    """Whether the box of a block (V, 3) meets a box open at the top."""
+    """Check whether the box of a block (V, 3) meets a box open at the top."""
     low, high = box
     return bool((corners.max(axis=0) > low).all() and (corners.min(axis=0)[:2] < high[:2]).all())

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 from stackgen.errors import StackgenError
 from stackgen.geometry import mirror
-from stackgen.robot.planning.order import BuildOrder, TopDownJaws, greedy_order, plan_order
+from stackgen.robot.planning.build_order import BuildOrder, TopDownJaws, greedy_order, plan_order
 from stackgen.sim.checkers import SimulatorChecker
-from stackgen.sim.statics.checker import EquilibriumChecker
+from stackgen.sim.statics.checker import StaticsChecker
 from stackgen.stack import Stack
 
 CUBE, RECTANGLE, LONG, TRIANGLE = range(4)
@@ -45,14 +45,14 @@ def test_every_state_of_a_safe_order_stands(stack: Stack, checker: SimulatorChec
     for step in range(1, len(stack) + 1):
         state = part(stack, order.blocks[:step])
         assert SimulatorChecker().check(state).stable
-        margin = EquilibriumChecker().check(state).margin
+        margin = StaticsChecker().check(state).margin
         assert margin is not None and order.margins[step - 1] == pytest.approx(np.degrees(margin))
 
 
 @pytest.mark.parametrize("stack", [SEESAW, ARCH, mirror(SEESAW)])
 def test_no_order_has_a_larger_least_margin(stack: Stack) -> None:
     """Against all permutations."""
-    checker, jaws, margins = EquilibriumChecker(), TopDownJaws(), {}
+    checker, jaws, margins = StaticsChecker(), TopDownJaws(), {}
 
     def margin(blocks: tuple[int, ...]) -> float:
         key = frozenset(blocks)
@@ -93,10 +93,10 @@ def test_a_mirrored_stack_is_as_safe() -> None:
     assert plan_order(mirror(SEESAW)).least_margin == pytest.approx(plan_order(SEESAW).least_margin)
 
 
-def test_a_counterweight_needs_a_third_hand_and_the_step_is_named() -> None:
+def test_a_counterweight_needs_a_temporary_support_and_the_step_is_named() -> None:
     order = plan_order(COUNTERWEIGHT)
     assert not order.safe and sorted(order.blocks) == [0, 1, 2, 3]
-    assert order.blocked is not None and "needs a third hand" in order.blocked and "\n" not in order.blocked
+    assert order.blocked is not None and "needs a temporary support" in order.blocked and "\n" not in order.blocked
     assert "block 3 (long_rectangle) is in the way of block 1 (rectangle), and without it block 1" in order.blocked
     assert "beside its support" in order.blocked
     assert SimulatorChecker().check(COUNTERWEIGHT).stable  # it is the way there that fails
@@ -130,7 +130,9 @@ def test_greedy_says_where_it_fails() -> None:
     cantilever = stack_of((CUBE, 0, 0), (LONG, -0.9, 1), (LONG, 0.9, 2))
     order = plan_order(cantilever, strategy="greedy")
     assert not order.safe
-    assert order.blocked is not None and order.blocked.startswith("step 2 of 3 needs a third hand: once block 1 (long")
+    assert order.blocked is not None and order.blocked.startswith(
+        "step 2 of 3 needs a temporary support: once block 1 (long"
+    )
     assert "centre of mass 0.40 cells beside its support" in order.blocked
 
 

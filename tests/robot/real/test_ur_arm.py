@@ -9,22 +9,22 @@ import pytest
 
 from stackgen.errors import StackgenError
 from stackgen.robot.planning.motion import Motion, joint_motion
-from stackgen.robot.real.build import RealBuild, carry_out, prepare, send
+from stackgen.robot.real.build_progress import BuildProgress
 from stackgen.robot.real.gripper import Gripper
 from stackgen.robot.real.program import Controller, controller_move, controller_pose
-from stackgen.robot.real.progress import Progress
-from stackgen.robot.real.rtde import UrArm
-from tests.robot.real.arms import CELL, TOWER, plan, stand_in
+from stackgen.robot.real.real_build import RealBuild, carry_out, prepare, send
+from stackgen.robot.real.ur_arm import UrArm
+from tests.robot.real.arms import TOWER, WORKCELL, plan, stand_in
 
 pytest.importorskip("rtde_control", reason="needs stackgen[ur]")
 pytest.importorskip("rtde_receive", reason="needs stackgen[ur]")
 
-NEARLY_HOME = tuple(np.array(CELL.home) + 0.5)
+NEARLY_HOME = tuple(np.array(WORKCELL.home) + 0.5)
 
 
 def job(folder: Path, resume: bool = False, **gripper: Any) -> RealBuild:
-    placed = Progress.read(folder).placed if resume else 0
-    return prepare(plan(placed), CELL, Controller(), Gripper(**gripper), folder, resume)
+    placed = BuildProgress.read(folder).placed if resume else 0
+    return prepare(plan(placed), WORKCELL, folder, controller=Controller(), gripper=Gripper(**gripper), resume=resume)
 
 
 def motions() -> list[Motion]:
@@ -39,11 +39,11 @@ def test_a_build_goes_where_it_was_planned_and_takes_every_block(tmp_path: Path)
         moved, jaws = controller.events("movej", "movel"), controller.events("jaws")
         halts = controller.events("halt")
     assert progress.status == "done" and stood == [1, 2]
-    assert Progress.read(tmp_path) == progress
+    assert BuildProgress.read(tmp_path) == progress
     assert len(moved) == len(motions())
     for event, motion in zip(moved, motions(), strict=True):
         assert event["event"] == {"joint": "movej", "line": "movel"}[motion.kind]
-        np.testing.assert_allclose(event["pose"][:3], controller_pose(motion.end, CELL)[:3], atol=1e-6)
+        np.testing.assert_allclose(event["pose"][:3], controller_pose(motion.end, WORKCELL)[:3], atol=1e-6)
         np.testing.assert_allclose(event["joints"], motion.end, atol=1e-4)
     assert [order["POS"] == 255 for order in jaws] == [False, True, False] * 2
     assert [halt["why"] for halt in halts] == ["asked to"]
@@ -62,7 +62,7 @@ def test_a_protective_stop_is_kept_and_the_build_goes_on_with_the_next_block(tmp
         with pytest.raises(StackgenError, match=r"protective stop; 1 of 2 blocks stand \(0\).*slot 2.*--resume"):
             carry_out(job(tmp_path), controller.host)
         assert len(controller.events("movej", "movel")) == in_second
-        stopped = Progress.read(tmp_path)
+        stopped = BuildProgress.read(tmp_path)
         assert (stopped.status, stopped.placed, stopped.next) == ("stopped", 1, 1)
         with pytest.raises(StackgenError, match="safety mode PROTECTIVE_STOP"):
             carry_out(job(tmp_path, resume=True), controller.host)
@@ -72,7 +72,7 @@ def test_a_protective_stop_is_kept_and_the_build_goes_on_with_the_next_block(tmp
         first = controller.events("movej", "movel")[0]
     assert (progress.status, progress.placed) == ("done", 2)
     away = plan().blocks[1].waiting.grasp[:2, 3]
-    tip = CELL.base.table_from_base @ np.diag([-1.0, -1, 1, 1]) @ [*first["pose"][:3], 1]
+    tip = WORKCELL.base.table_from_base @ np.diag([-1.0, -1, 1, 1]) @ [*first["pose"][:3], 1]
     np.testing.assert_allclose(tip[:2], away, atol=1e-4)
 
 
@@ -82,7 +82,7 @@ def test_a_controller_that_vanishes_is_one_line_and_the_build_is_kept(tmp_path: 
         with pytest.raises(StackgenError, match=r"lost the connection to 127.*0 of 2 blocks stand; next is block 0"):
             carry_out(job(tmp_path), controller.host)
         assert time.monotonic() - begin < 30
-    assert Progress.read(tmp_path).status == "stopped"
+    assert BuildProgress.read(tmp_path).status == "stopped"
 
 
 def test_jaws_that_close_on_nothing_stop_the_build_before_the_arm_lifts(tmp_path: Path) -> None:
@@ -96,10 +96,10 @@ def test_jaws_that_close_on_nothing_stop_the_build_before_the_arm_lifts(tmp_path
 @pytest.mark.parametrize(
     ("options", "joints", "line"),
     [
-        (["--local"], CELL.home, "local mode: switch it to remote control"),
-        (["--mode", "POWER_OFF"], CELL.home, "mode POWER_OFF: switch it on"),
-        (["--program"], CELL.home, "has a program going"),
-        ([], (0.0, *CELL.home[1:]), r"not at its home position \(joint 1 is 16 degrees away\)"),
+        (["--local"], WORKCELL.home, "local mode: switch it to remote control"),
+        (["--mode", "POWER_OFF"], WORKCELL.home, "mode POWER_OFF: switch it on"),
+        (["--program"], WORKCELL.home, "has a program going"),
+        ([], (0.0, *WORKCELL.home[1:]), r"not at its home position \(joint 1 is 16 degrees away\)"),
     ],
 )
 def test_an_arm_that_is_not_ready_is_one_line_and_does_not_move(
@@ -114,7 +114,7 @@ def test_an_arm_that_is_not_ready_is_one_line_and_does_not_move(
 def test_an_arm_before_remote_control_was_invented_needs_none(tmp_path: Path) -> None:
     with (
         stand_in(tmp_path, "--version", "3.15", "--local") as controller,
-        UrArm(controller.host, CELL, Controller(), Gripper()) as arm,
+        UrArm(controller.host, WORKCELL, Controller(), Gripper()) as arm,
     ):
         assert arm.state().stopped is None
 
@@ -126,35 +126,35 @@ def test_a_controller_that_is_not_there_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_motion_that_starts_elsewhere_is_refused(tmp_path: Path) -> None:
-    elsewhere = joint_motion("transit", CELL.home_joints + 0.2, CELL.home_joints + 0.4, CELL.speeds)
+    elsewhere = joint_motion("transit", WORKCELL.home_joints + 0.2, WORKCELL.home_joints + 0.4, WORKCELL.speeds)
     assert elsewhere is not None
     with stand_in(tmp_path) as controller:
         line = pytest.raises(StackgenError, match=r"11\.5 degrees from where its next motion")
-        with UrArm(controller.host, CELL, Controller(), Gripper()) as arm, line:
+        with UrArm(controller.host, WORKCELL, Controller(), Gripper()) as arm, line:
             arm.move(elsewhere)
         assert controller.events("movej", "movel") == []
 
 
 def test_a_controller_that_is_not_heard_from_stops_the_arm(tmp_path: Path) -> None:
-    motion = joint_motion("transit", CELL.home_joints, CELL.home_joints + 0.2, CELL.speeds)
+    motion = joint_motion("transit", WORKCELL.home_joints, WORKCELL.home_joints + 0.2, WORKCELL.speeds)
     assert motion is not None
     with (
         stand_in(tmp_path, "--motion", "60") as controller,
-        UrArm(controller.host, CELL, Controller(), Gripper()) as arm,
+        UrArm(controller.host, WORKCELL, Controller(), Gripper()) as arm,
     ):
-        assert arm._start(controller_move(motion, CELL))
+        assert arm._start(controller_move(motion, WORKCELL))
         time.sleep(3)  # as if this process hung
         assert [halt["why"] for halt in controller.events("halt")] == ["watchdog"]
         with pytest.raises(StackgenError, match="stopped or paused at the controller"):
             arm.move(motion)
-        assert np.abs(arm.state().joints - CELL.home_joints).max() < 0.02
+        assert np.abs(arm.state().joints - WORKCELL.home_joints).max() < 0.02
 
 
 def test_another_tool_than_the_cells_is_noticed(tmp_path: Path) -> None:
-    """A UR3 or UR10 has its finger tips elsewhere; here the tolerance is too tight for the right arm."""
+    """Another arm has its finger tips elsewhere; here the tolerance is too tight for the right arm."""
     with stand_in(tmp_path) as controller:
-        with pytest.raises(StackgenError, match="is it a UR5"):
-            UrArm(controller.host, CELL, Controller(agreement=1e-15), Gripper())
+        with pytest.raises(StackgenError, match=r"is it the arm of cell\.arm"):
+            UrArm(controller.host, WORKCELL, Controller(agreement=1e-15), Gripper())
         assert controller.events("movej", "movel") == []
 
 

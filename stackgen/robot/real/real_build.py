@@ -1,4 +1,4 @@
-"""A build with a real arm: rehearsed first, asked for, kept on disk block by block, and gone on with after a stop."""
+"""A build with a real arm: rehearsed, confirmed, kept on disk block by block, and resumed after a stop."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from rich.table import Table
 
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
-from stackgen.robot.backend import ArmBackend
-from stackgen.robot.build import execute
+from stackgen.robot.backend import ArmBackend, execute
 from stackgen.robot.planning.plan import BlockPlan, BuildPlan
+from stackgen.robot.real.build_progress import FILE, BuildProgress
 from stackgen.robot.real.gripper import Gripper
 from stackgen.robot.real.program import Controller
-from stackgen.robot.real.progress import FILE, Progress
 from stackgen.robot.real.urscript import urscript
-from stackgen.robot.workcell import Cell
+from stackgen.robot.workcell import Workcell
 
 PROGRAM = "build.script"
 MESSAGES = "ur-rtde.log"
@@ -31,55 +30,69 @@ class RealBuild:
 
     Args:
         plan: All motions; those of the blocks that stand already are left out.
-        cell: Of the plan.
-        controller: Of the real arm.
-        gripper: Of the real jaws.
-        folder: For the program, the progress and the client's messages.
-        progress: What stands already.
+        workcell: Workcell of the plan.
+        controller: Settings of the real arm's controller.
+        gripper: Settings of the real jaws.
+        folder: Folder for the program, the progress and the client's messages.
+        progress: Progress so far.
     """
 
     plan: BuildPlan
-    cell: Cell
+    workcell: Workcell
     controller: Controller
     gripper: Gripper
     folder: Path
-    progress: Progress
+    progress: BuildProgress
 
 
 def placed_before(folder: Path, resume: bool) -> int:
-    """How many blocks of a build stand already, which a plan has to know.
+    """Read how many blocks of a build stand already, which a plan has to know.
 
     Raises:
-        StackgenError: If there is nothing to go on with.
+        StackgenError: If there is nothing to resume.
     """
     if not resume:
         return 0
-    found = Progress.read(folder)
+    found = BuildProgress.read(folder)
     if found.next is None:
         raise StackgenError(f"--resume: all {len(found.order)} blocks of {folder} stand already")
     return found.placed
 
 
 def prepare(
-    plan: BuildPlan, cell: Cell, controller: Controller, gripper: Gripper, folder: Path, resume: bool
+    plan: BuildPlan,
+    workcell: Workcell,
+    folder: Path,
+    *,
+    controller: Controller,
+    gripper: Gripper,
+    resume: bool = False,
 ) -> RealBuild:
-    """Check a plan against the cell's limits and write its program; nothing moves.
+    """Check a plan against the workcell's limits and write its program; nothing moves.
+
+    Args:
+        plan: Plan of the build.
+        workcell: Workcell of the plan.
+        folder: Folder for the program, the progress and the client's messages.
+        controller: Settings of the real arm's controller.
+        gripper: Settings of the real jaws.
+        resume: Whether the plan resumes the build in the folder.
 
     Raises:
-        StackgenError: If a motion leaves the workspace or is too fast, or --resume has another build in mind.
+        StackgenError: If a motion leaves the workspace or is too fast, or the folder holds another build.
     """
-    progress = Progress.of(plan.stack, plan.order, cell)
+    progress = BuildProgress.of(plan.stack, plan.order, workcell)
     if resume:
-        found = Progress.read(folder)
-        found.require_same(plan.stack, plan.order, cell)
+        found = BuildProgress.read(folder)
+        found.require_same(plan.stack, plan.order, workcell)
         progress = replace(progress, placed=found.placed)
-    program = urscript(plan, cell, controller, gripper)
+    program = urscript(plan, workcell, controller, gripper)
     write_atomically(folder / PROGRAM, program.encode())
-    return RealBuild(plan, cell, controller, gripper, folder, progress)
+    return RealBuild(plan, workcell, controller, gripper, folder, progress)
 
 
 def show(build: RealBuild) -> None:
-    """What would move, a row for each block."""
+    """Print what would move, a row for each block."""
     table = Table("block", "from slot", "to x, y, z", "motions", "time", "clearance", box=None, pad_edge=False)
     for column in table.columns[1:]:
         column.justify = "right"
@@ -101,7 +114,8 @@ def confirm(build: RealBuild, host: str, yes: bool) -> None:
     """Ask whether the arm may move.
 
     Raises:
-        StackgenError: If nobody can answer, the answer is not yes, or blocks of an interrupted build may stand.
+        StackgenError: If there is no terminal to ask on, the answer is not yes, or blocks of an interrupted build
+            may stand.
     """
     require_clear(build)
     if yes:
@@ -119,18 +133,18 @@ def confirm(build: RealBuild, host: str, yes: bool) -> None:
 
 
 def require_clear(build: RealBuild) -> None:
-    """See that a build that begins anew does not forget one that was interrupted: its blocks stand in the way.
+    """See that a new build does not forget an interrupted one: its blocks stand in the way.
 
     Raises:
         StackgenError: If there is one in its folder.
     """
     if build.progress.placed or not (build.folder / FILE).exists():
         return
-    before = Progress.read(build.folder)
+    before = BuildProgress.read(build.folder)
     if before.placed and before.status != "done":
         raise StackgenError(
-            f"{build.folder} holds a build that was interrupted, {before.describe()}: say --resume to go on, or clear"
-            f" the table and delete {build.folder / FILE}"
+            f"{build.folder} holds a build that was interrupted, {before.describe()}: say --resume to continue it, or"
+            f" clear the table and delete {build.folder / FILE}"
         )
 
 
@@ -138,21 +152,21 @@ def carry_out(
     build: RealBuild,
     host: str,
     on_block: Callable[[int], None] = lambda done: None,
-) -> Progress:
+) -> BuildProgress:
     """Have the real arm build.
 
     Args:
-        build: From :func:`prepare`.
-        host: Of the controller.
-        on_block: Told how many blocks stand.
+        build: Build from :func:`prepare`.
+        host: Address of the controller.
+        on_block: Called with the number of blocks that stand.
 
     Raises:
         StackgenError: If the arm is not ready, in which case nothing has moved, or stops, in which case the progress
-            is kept; the line says how to go on.
+            is kept; the line says how to resume.
     """
-    from stackgen.robot.real.rtde import UrArm
+    from stackgen.robot.real.ur_arm import UrArm
 
-    with UrArm(host, build.cell, build.controller, build.gripper) as arm:
+    with UrArm(host, build.workcell, build.controller, build.gripper) as arm:
         return run(build, arm, arm.begin, on_block)
 
 
@@ -161,12 +175,12 @@ def run(
     arm: ArmBackend,
     on_start: Callable[[BlockPlan], None] = lambda step: None,
     on_block: Callable[[int], None] = lambda done: None,
-) -> Progress:
+) -> BuildProgress:
     """Have an arm that stands at home build, and keep the progress on disk after every block.
 
     Raises:
         StackgenError: If the arm stops.
-        KeyboardInterrupt: With a line that says how to go on.
+        KeyboardInterrupt: With a line that says how to resume.
     """
     progress = build.progress
     progress.write(build.folder)
@@ -181,18 +195,18 @@ def run(
         execute(build.plan, arm, on_start=on_start, on_done=done)
     except StackgenError as error:
         replace(progress, status="stopped", why=str(error)).write(build.folder)
-        raise StackgenError(f"{_reason(error)}; {how_to_go_on(progress)}") from error
+        raise StackgenError(f"{_reason(error)}; {how_to_resume(progress)}") from error
     except KeyboardInterrupt:
         arm.stop()
         replace(progress, status="stopped", why="interrupted").write(build.folder)
-        raise KeyboardInterrupt(f"the arm was stopped; {how_to_go_on(progress)}") from None
+        raise KeyboardInterrupt(f"the arm was stopped; {how_to_resume(progress)}") from None
     progress = replace(progress, status="done")
     progress.write(build.folder)
     return progress
 
 
-def how_to_go_on(progress: Progress) -> str:
-    """After a stop."""
+def how_to_resume(progress: BuildProgress) -> str:
+    """Say how to resume a build after a stop."""
     if progress.next is None:
         return "all blocks stand; bring the arm home at the pendant"
     slot = progress.placed + 1
@@ -215,7 +229,7 @@ def send(build: RealBuild, host: str, port: int = 30002) -> None:
     """
     import socket
 
-    from stackgen.robot.real.dashboard import require_ready
+    from stackgen.robot.real.readiness import require_ready
 
     require_ready(host)
     try:
