@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from stackgen.commands.parsing import Command, Files
-from stackgen.models.weights import resolve_weights
 
 
 def main(checkpoint: Path, out: Path, half: bool = False) -> None:
@@ -17,9 +16,9 @@ def main(checkpoint: Path, out: Path, half: bool = False) -> None:
         out: File to write, ending in .safetensors; the card gets the same name with .json.
         half: Whether to store matrices as 16-bit floats, which halves the size.
     """
-    from stackgen.models.weights import export_checkpoint
+    from stackgen.models.weights import export_checkpoint, last_checkpoint  # loads torch, which --help does without
 
-    export_checkpoint(Path(resolve_weights(checkpoint)), out, half=half)
+    export_checkpoint(last_checkpoint(checkpoint) if checkpoint.is_dir() else checkpoint, out, half=half)
     print(f"wrote {out}\nwrote {out.with_suffix('.json')}")
 
 
