@@ -3,24 +3,22 @@
 import torch
 from torch import Tensor
 
-from stackgen._lightning import pl
-from stackgen.models.diffusion.denoiser import mlp, raster_order
-from stackgen.models.module import WorldMixin
+from stackgen.models.module import StackgenModule
+from stackgen.models.poses import raster_order
+from stackgen.models.transformer import mlp
+from stackgen.world import World
 
 
-class SilhouetteMLP(WorldMixin, pl.LightningModule):
-    """WorldMixin learns grid, shapes and N from the data, and calls `build` when it knows them."""
+class SilhouetteMLP(StackgenModule):
+    """A StackgenModule learns its world from the data, calls `make` when it knows it, and brings AdamW."""
 
     kind = "silhouette-mlp"
 
-    def __init__(self, width: int = 256, learning_rate: float = 1e-3) -> None:
-        super().__init__()
-        self.config, self.learning_rate = {"width": width}, learning_rate
+    def __init__(self, width: int = 256) -> None:
+        super().__init__({"width": width})
 
-    def build(self) -> None:
-        if not hasattr(self, "model"):
-            inputs = self.grid.image_size**2 + len(self.catalogue)
-            self.model = mlp(inputs, self.config["width"], self.max_blocks * 6)
+    def make(self, world: World) -> torch.nn.Module:
+        return mlp(world.grid.image_size**2 + len(world.catalogue), self.config["width"], world.max_blocks * 6)
 
     def forward(self, silhouettes: Tensor, counts: Tensor) -> Tensor:
         return self.model(torch.cat([silhouettes.flatten(1), counts.float()], dim=1)).unflatten(1, (-1, 6))
@@ -37,9 +35,6 @@ class SilhouetteMLP(WorldMixin, pl.LightningModule):
 
     def validation_step(self, batch: dict[str, Tensor], index: int) -> None:
         self.log_mean("validation/loss", self.loss(batch), len(batch["mask"]))
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.AdamW(self.parameters(), lr=self.learning_rate)
 
     def sampler(self) -> object:  # by which SampleQuality watches the training
         from examples.extending.sampler import MLPSampler

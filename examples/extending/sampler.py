@@ -1,4 +1,7 @@
-"""The model of model.py as whoever measures, reports, draws or builds wants it: a StackSampler."""
+"""The model of model.py as a StackSampler, which can be measured, reported, drawn and built."""
+
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,18 +14,20 @@ from stackgen.world import Mask
 
 
 class MLPSampler:
-    """One method, `sample_batch`; here from a module in training, or from a checkpoint."""
+    """A StackSampler: the world it knows, what is on record, and `sample_batch`; from a module or a checkpoint."""
+
+    settings: Mapping[str, Any] = {}
 
     def __init__(self, trained: SilhouetteMLP | str) -> None:
         self.module = load(trained) if isinstance(trained, str) else trained
-        self.catalogue, self.grid = self.module.catalogue, self.module.grid
+        self.world, self.card = self.module.world, self.module.card()
 
     @torch.no_grad()
     def sample_batch(
         self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
     ) -> list[list[Stack]]:
         poses = self.module(torch.from_numpy(silhouettes).float(), torch.from_numpy(counts)).double().numpy()
-        stacks = [Stack(shapes_of(c), p[: c.sum()], self.catalogue) for c, p in zip(counts, poses, strict=True)]
+        stacks = [Stack(shapes_of(c), p[: c.sum()], self.world.catalogue) for c, p in zip(counts, poses, strict=True)]
         return [[stack] * num_samples for stack in stacks]
 
 

@@ -48,25 +48,21 @@ class StackgenModule(pl.LightningModule):
     def prepare(self, data: Any) -> None:
         """Take from the training data (a StackDataModule) what a new network needs; nothing by default."""
 
-    def build(self) -> None:
-        """Make the network, once."""
+    def build(self, world: World) -> None:
+        """Take a world, and make the network for it if there is none yet."""
+        self.world = world
         if not hasattr(self, "model"):
-            self.model = self.make(self.world)
+            self.model = self.make(world)
 
     def setup(self, stage: str) -> None:
         """Learn the world from the data and build the network; what a checkpoint holds is loaded later."""
-        data = getattr(self.trainer, "datamodule", None) if stage == "fit" else None
-        if data is not None:
-            manifest = data.manifest
-            self.world = data.world
-            self.dataset = {
-                "name": manifest.name,
-                "sha256": manifest.sha256,
-                "counts": manifest.counts,
-                "physics": manifest.physics,
-            }
-        self.build()
-        if data is not None:
+        data = getattr(self.trainer, "datamodule", None)
+        if data is None or (stage != "fit" and hasattr(self, "model")):
+            return
+        self.build(data.world)
+        if stage == "fit":
+            facts = data.manifest
+            self.dataset = {name: getattr(facts, name) for name in ("name", "sha256", "counts", "physics")}
             self.prepare(data)
 
     def configure_optimizers(self) -> Any:
@@ -111,8 +107,8 @@ class StackgenModule(pl.LightningModule):
         card = checkpoint.get(CHECKPOINT_KEY)
         if not isinstance(card, dict) or card.get("kind") != self.kind:
             raise StackgenError(f"the checkpoint is not one of a {type(self).__name__} of stackgen")
-        self.world, self.dataset = World.from_json(card), card["dataset"]
-        self.build()
+        self.dataset = card["dataset"]
+        self.build(World.from_json(card))
 
 
 class PoseModule(StackgenModule):

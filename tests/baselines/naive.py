@@ -16,8 +16,8 @@ from stackgen.world import Mask
 
 def naive_search(method: BruteForce, target: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
     """The stack before the swap, by trying k x n candidates in a loop."""
-    shapes = sorted(shapes_of(counts).tolist(), key=lambda s: -method.catalogue[s].volume)
-    placed = Stack(np.zeros(0, dtype=np.int64), np.zeros((0, 6)), method.catalogue)
+    shapes = sorted(shapes_of(counts).tolist(), key=lambda s: -method.world.catalogue[s].volume)
+    placed = Stack(np.zeros(0, dtype=np.int64), np.zeros((0, 6)), method.world.catalogue)
     for shape in shapes:
         pictures = [_picture(method, s, pose) for s, pose in zip(placed.shapes.tolist(), placed.poses, strict=True)]
         best_key, best_pose = None, None
@@ -33,12 +33,12 @@ def naive_search(method: BruteForce, target: Mask, counts: NDArray[np.int64], rn
             if best_key is None or key < best_key:
                 best_key, best_pose = key, pose
         assert best_pose is not None
-        placed = Stack(np.append(placed.shapes, shape), np.vstack([placed.poses, best_pose]), method.catalogue)
+        placed = Stack(np.append(placed.shapes, shape), np.vstack([placed.poses, best_pose]), method.world.catalogue)
     return placed
 
 
 def _picture(method: BruteForce, shape: int, pose: NDArray[np.float64]) -> Mask:
-    return silhouette(Stack(np.array([shape]), pose[None], method.catalogue), grid=method.grid)
+    return silhouette(Stack(np.array([shape]), pose[None], method.world.catalogue), method.world.grid)
 
 
 def _free_beside(picture: Mask, free: Mask) -> int:

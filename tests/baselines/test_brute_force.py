@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 
 from stackgen.baselines.brute_force import BruteForce
-from stackgen.data.datamodule import TESTSET
-from stackgen.data.loading.arrays import load_dataset
+from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.errors import StackgenError
 from stackgen.evaluation.protocol import Scene, scenes_of
 from stackgen.geometry import iou, silhouette
 from stackgen.stack import Stack
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID
 from tests.baselines.naive import naive_search
 
 
 @pytest.fixture(scope="module")
 def scenes() -> list[Scene]:
     """Ten of the frozen test scenes."""
-    arrays = load_dataset(TESTSET, ("test",))[0]["test"]
-    return scenes_of(arrays.select(np.arange(0, 500, 50)))
+    arrays = Dataset.open(TESTSET).split("test")
+    return scenes_of(arrays.select(np.arange(0, 500, 50)), PAPER_CATALOGUE)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_a_lone_block_is_found() -> None:
     method = BruteForce(sigma=0)
     for shape in range(4):
         x, level = rng.uniform(-0.5, 0.5), int(rng.integers(0, 4))
-        target = silhouette(Stack(np.array([shape]), np.array([[x, 0, level + 0.5, 0, 0, 0]])))
+        target = silhouette(Stack(np.array([shape]), np.array([[x, 0, level + 0.5, 0, 0, 0]])), PAPER_GRID)
         (found,) = method.search(target, np.eye(4, dtype=np.int64)[shape], rng).poses
         assert found[2] == level + 0.5
         assert abs(found[0] - x) < 0.1
@@ -91,7 +91,7 @@ def test_blocks_keep_clear_of_each_other() -> None:
     for seed in range(5):
         found = BruteForce(sigma=0).search(target, np.array([2, 0, 0, 0]), np.random.default_rng(seed))
         assert abs(found.poses[0, 0] - found.poses[1, 0]) > 0.85
-        assert iou(silhouette(found), target) > 0.85
+        assert iou(silhouette(found, PAPER_GRID), target) > 0.85
     target[:, 32:] = False  # room for one only
     shifts = []
     for penalty in (0.0, 2.0):

@@ -15,7 +15,7 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette, silhouette_iou
 from stackgen.sampling.feasible import layout
 from stackgen.stack import Stack, parse_block_list
-from stackgen.world import PAPER_GRID
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID
 
 CUBE, RECTANGLE, LONG, TRIANGLE = range(4)
 Row = list[tuple[int, float]]
@@ -34,28 +34,28 @@ STAIRS = stack([(LONG, -0.5), (CUBE, 1.5)], [(RECTANGLE, -1), (CUBE, 0.5)], [(CU
 
 @pytest.mark.parametrize("truth", [PYRAMID, BRIDGE, STAIRS], ids=["pyramid", "bridge", "stairs"])
 def test_what_longest_first_can_make_is_made(truth: Stack) -> None:
-    built, left = GreedyRandom().fill(silhouette(truth), truth.counts)
+    built, left = GreedyRandom().fill(silhouette(truth, PAPER_GRID), truth.counts)
     assert not left.any()
-    assert layout(built) == layout(truth)
-    assert silhouette_iou(built, silhouette(truth)) > 0.93
+    assert layout(built, PAPER_GRID) == layout(truth, PAPER_GRID)
+    assert silhouette_iou(built, silhouette(truth, PAPER_GRID), PAPER_GRID) > 0.93
 
 
 def test_order_is_bottom_up_and_longest_run_first() -> None:
     truth = stack([(CUBE, -1.5), (RECTANGLE, 0.5)], [(RECTANGLE, 0.5)])
-    built, _ = GreedyRandom().fill(silhouette(truth), truth.counts)
+    built, _ = GreedyRandom().fill(silhouette(truth, PAPER_GRID), truth.counts)
     assert built.shapes.tolist() == [RECTANGLE, CUBE, RECTANGLE]
     assert built.poses[:, 2].tolist() == [0.5, 0.5, 1.5]
 
 
 def test_the_longest_block_that_fits_stands_at_the_left_end() -> None:
-    target = silhouette(stack([(RECTANGLE, -1), (RECTANGLE, 1)]))
-    built, left = GreedyRandom().fill(target, parse_block_list("long_rectangle=1,cube=2"))
+    target = silhouette(stack([(RECTANGLE, -1), (RECTANGLE, 1)]), PAPER_GRID)
+    built, left = GreedyRandom().fill(target, parse_block_list("long_rectangle=1,cube=2", PAPER_CATALOGUE, MAX_BLOCKS))
     assert built.names == ["long_rectangle", "cube"] and left.tolist() == [1, 0, 0, 0]
     assert np.allclose(built.poses[:, 0], [-0.5, 1.5], atol=0.04)
 
 
 def test_what_fits_nowhere_lies_on_the_ground_beside() -> None:
-    target = silhouette(stack([(CUBE, 0)]))
+    target = silhouette(stack([(CUBE, 0)]), PAPER_GRID)
     (built,) = GreedyRandom(sigma=0).sample_batch(target[None], np.array([[1, 2, 0, 0]]), 1, 0)[0]
     assert built.counts.tolist() == [1, 2, 0, 0]
     assert (built.poses[1:, 2] == 0.5).all()
@@ -64,9 +64,11 @@ def test_what_fits_nowhere_lies_on_the_ground_beside() -> None:
 
 
 def test_a_run_is_measured_to_the_pixel() -> None:
-    runs = layer_runs(silhouette(stack([(CUBE, -1.5), (RECTANGLE, 0.5)], [(TRIANGLE, 0.25)])), 0, PAPER_GRID)
+    runs = layer_runs(
+        silhouette(stack([(CUBE, -1.5), (RECTANGLE, 0.5)], [(TRIANGLE, 0.25)]), PAPER_GRID), 0, PAPER_GRID
+    )
     assert np.allclose(runs, [(-2, -1), (-0.5, 1.5)], atol=0.04)
-    (triangle,) = layer_runs(silhouette(stack([(CUBE, 0)], [(TRIANGLE, 0.25)])), 1, PAPER_GRID)
+    (triangle,) = layer_runs(silhouette(stack([(CUBE, 0)], [(TRIANGLE, 0.25)]), PAPER_GRID), 1, PAPER_GRID)
     assert np.allclose(triangle, (0, 0.5), atol=0.08)
     assert layer_runs(np.zeros((64, 64), bool), 2, PAPER_GRID) == []
 
@@ -90,13 +92,15 @@ SWAPPABLE = stack([(RECTANGLE, -1), (RECTANGLE, 1)], [(CUBE, -0.5), (CUBE, 0.5)]
 def test_the_swap_comes_with_probability_sigma() -> None:
     for sigma in (0.0, 0.6, 1.0):
         rng = np.random.default_rng(7)
-        changed = [layout(swap(SWAPPABLE, sigma, rng)) != layout(SWAPPABLE) for _ in range(1000)]
+        changed = [
+            layout(swap(SWAPPABLE, sigma, rng), PAPER_GRID) != layout(SWAPPABLE, PAPER_GRID) for _ in range(1000)
+        ]
         assert abs(np.mean(changed) - sigma) <= 0.05 * (0 < sigma < 1)
 
 
 def test_every_possible_swap_comes_up_alike() -> None:
     rng = np.random.default_rng(1)
-    found = [layout(swap(SWAPPABLE, 1.0, rng))[0] for _ in range(400)]
+    found = [layout(swap(SWAPPABLE, 1.0, rng), PAPER_GRID)[0] for _ in range(400)]
     left = np.mean([row == (CUBE, CUBE, RECTANGLE) for row in found])
     assert set(found) == {(CUBE, CUBE, RECTANGLE), (RECTANGLE, CUBE, CUBE)}
     assert abs(left - 0.5) < 0.1
@@ -115,8 +119,8 @@ def test_a_swap_keeps_block_list_and_silhouette(seed: int) -> None:
     before = stack(*rows)
     after = swap(before, 1.0, rng)
     assert np.array_equal(before.shapes, after.shapes)
-    assert np.array_equal(silhouette(before), silhouette(after))
-    possible = RECTANGLE in before.shapes and any((CUBE, CUBE) in pairwise(r) for r in layout(before))
+    assert np.array_equal(silhouette(before, PAPER_GRID), silhouette(after, PAPER_GRID))
+    possible = RECTANGLE in before.shapes and any((CUBE, CUBE) in pairwise(r) for r in layout(before, PAPER_GRID))
     assert np.array_equal(before.poses, after.poses) == (not possible)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +12,7 @@ from scipy.stats import kstest
 
 from stackgen.baselines.random_placement import RandomPlacement
 from stackgen.stack import Stack
-from stackgen.world import PAPER_CATALOGUE, Catalogue, Grid, Shape
+from stackgen.world import PAPER_CATALOGUE, PAPER_WORLD, Catalogue, Grid, Shape
 
 PICTURE = np.zeros((64, 64), dtype=bool)
 
@@ -49,7 +51,7 @@ def test_a_place_is_drawn_uniformly_from_all_legal_ones() -> None:
 
 
 def test_above_the_grid_only_where_there_is_no_room_below() -> None:
-    low = RandomPlacement(grid=Grid(height=1))
+    low = RandomPlacement(replace(PAPER_WORLD, grid=Grid(height=1)))
     levels = [
         low.place(PICTURE, np.array([0, 0, 3, 0]), np.random.default_rng(seed)).poses[:, 2].tolist()
         for seed in range(5)
@@ -58,6 +60,7 @@ def test_above_the_grid_only_where_there_is_no_room_below() -> None:
 
 
 def test_a_block_as_wide_as_the_grid_has_one_place_in_a_layer() -> None:
-    planks = RandomPlacement(catalogue=Catalogue((Shape.box("plank", 4), *PAPER_CATALOGUE.shapes)))
+    catalogue = Catalogue((Shape.box("plank", 4), *PAPER_CATALOGUE.shapes))
+    planks = RandomPlacement(replace(PAPER_WORLD, catalogue=catalogue))
     stack = planks.place(PICTURE, np.array([3, 0, 0, 0, 0]), np.random.default_rng(0))
     assert stack.poses[:, 0].tolist() == [0, 0, 0] and stack.poses[:, 2].tolist() == [0.5, 1.5, 2.5]

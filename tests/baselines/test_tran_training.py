@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from stackgen.baselines.tran_reg_module import TranReg
-from stackgen.baselines.tran_vae_module import TranVAE
-from stackgen.data.loading.arrays import StackArrays
 
 from stackgen._lightning import pl
-from stackgen.baselines.tran_reg import PoseRegression
-from stackgen.baselines.tran_vae import PoseVAE, VAEConfig
-from stackgen.baselines.transformer import RegressionConfig
+from stackgen.baselines.modules import TranReg, TranVAE
+from stackgen.baselines.regression import RegressionConfig
+from stackgen.baselines.tran_reg import TranRegNetwork
+from stackgen.baselines.tran_vae import TranVAENetwork, VAEConfig
+from stackgen.data.arrays import StackArrays
 from stackgen.data.datamodule import StackDataModule
 from stackgen.errors import StackgenError
-from stackgen.models.diffusion.denoiser import Denoiser, DenoiserConfig
+from stackgen.models.diffusion.denoiser import Denoiser
 from stackgen.models.optimization import OptimizerConfig
+from stackgen.models.transformer import TransformerConfig
 from stackgen.models.weights import export_checkpoint, last_checkpoint
 from stackgen.protocols import StackSampler
 from stackgen.sampling.methods import load_predictor, load_sampler
@@ -38,7 +38,7 @@ FAST = OptimizerConfig(learning_rate=3e-3, warmup=2)
 METHODS = ["tran-reg", "tran-vae"]
 
 
-def module_for(method: str, base: DenoiserConfig = TINY_CROSS, assignment: Any = "matched") -> TranReg | TranVAE:
+def module_for(method: str, base: TransformerConfig = TINY_CROSS, assignment: Any = "matched") -> TranReg | TranVAE:
     pl.seed_everything(0, verbose=False)
     transformer, regression = replace(base, layers=2), RegressionConfig(assignment, least_std=0.05)
     if method == "tran-reg":
@@ -69,7 +69,7 @@ def arrays(compact: Path) -> StackArrays:
 @pytest.mark.parametrize("base", [TINY, TINY_CROSS], ids=["paper", "cross"])
 @pytest.mark.parametrize("method", METHODS)
 def test_a_short_training_learns_to_build_towers(
-    method: str, base: DenoiserConfig, compact: Path, arrays: StackArrays, tmp_path: Path
+    method: str, base: TransformerConfig, compact: Path, arrays: StackArrays, tmp_path: Path
 ) -> None:
     module = module_for(method, base)
     module.optimizer_config = OptimizerConfig(learning_rate=0.01, warmup=5)
@@ -104,7 +104,7 @@ def test_the_autoencoder_s_loss_is_error_and_weighted_divergence(compact: Path, 
 
 def test_the_divergence_is_not_taxed_in_the_beginning(compact: Path) -> None:
     module = module_for("tran-vae")
-    module.build()
+    module.build(PAPER_WORLD)
     batch = next(iter(data_of(compact).train_dataloader()))
     for training, weight in ((True, 0.0), (False, 0.01)):
         module.train(training)
@@ -155,7 +155,7 @@ def test_a_card_that_does_not_fit_is_refused(method: str, tmp_path: Path) -> Non
     from stackgen.models.weights import write_weights
 
     module = module_for(method)
-    module.build()
+    module.build(PAPER_WORLD)
     path = tmp_path / "x.safetensors"
     write_weights(path, module.model.state_dict(), module.card())
     for part in ("transformer", "regression"):
@@ -212,11 +212,11 @@ def settings(folder: str, name: str) -> dict[str, Any]:
 
 
 def test_the_paper_s_baselines_are_as_large_as_its_denoiser() -> None:
-    denoiser = DenoiserConfig(**settings("model", "ddpm-paper")["model"]["init_args"]["denoiser"])
-    assert denoiser == DenoiserConfig()
+    denoiser = TransformerConfig(**settings("model", "ddpm-paper")["model"]["init_args"]["denoiser"])
+    assert denoiser == TransformerConfig()
     for method in METHODS:
         options = settings("baselines", f"{method}-paper")
-        assert DenoiserConfig(**options["model"]["init_args"]["transformer"]) == denoiser
+        assert TransformerConfig(**options["model"]["init_args"]["transformer"]) == denoiser
         assert options["data"] == settings("model", "ddpm-paper")["data"]
         assert options["trainer"]["max_epochs"] == settings("model", "ddpm-paper")["trainer"]["max_epochs"]
 
@@ -224,11 +224,11 @@ def test_the_paper_s_baselines_are_as_large_as_its_denoiser() -> None:
 def test_only_the_generative_part_differs_at_the_small_size() -> None:
     ours = settings("model", "ddpm-small")
     # Feeding the last estimate back is a part of generating in steps.
-    denoiser = replace(DenoiserConfig(**ours["model"]["init_args"]["denoiser"]), self_conditioning=False)
+    denoiser = replace(TransformerConfig(**ours["model"]["init_args"]["denoiser"]), self_conditioning=False)
     for method in METHODS:
         options = settings("baselines", method)
         given = options["model"]["init_args"]
-        assert DenoiserConfig(**given["transformer"]) == denoiser
+        assert TransformerConfig(**given["transformer"]) == denoiser
         assert given["regression"]["least_std"] == ours["model"]["init_args"]["diffusion"]["least_std"]
         assert options["data"] == ours["data"] and options["trainer"]["callbacks"] == ours["trainer"]["callbacks"]
 
@@ -248,13 +248,13 @@ def test_the_small_paper_recipe_is_the_paper_s_but_for_its_size() -> None:
 
 def test_the_small_networks_are_about_as_large() -> None:
     ours = settings("model", "ddpm-small")["model"]["init_args"]["denoiser"]
-    size = sum(p.numel() for p in Denoiser(DenoiserConfig(**ours), PAPER_WORLD).parameters())
+    size = sum(p.numel() for p in Denoiser(TransformerConfig(**ours), PAPER_WORLD).parameters())
     for method in METHODS:
         given = settings("baselines", method)["model"]["init_args"]
-        transformer, regression = DenoiserConfig(**given["transformer"]), RegressionConfig(**given["regression"])
+        transformer, regression = TransformerConfig(**given["transformer"]), RegressionConfig(**given["regression"])
         network = (
-            PoseRegression(transformer, regression, PAPER_WORLD)
+            TranRegNetwork(transformer, regression, PAPER_WORLD)
             if method == "tran-reg"
-            else PoseVAE(transformer, regression, VAEConfig(**given["vae"]), PAPER_WORLD)
+            else TranVAENetwork(transformer, regression, VAEConfig(**given["vae"]), PAPER_WORLD)
         )
         assert sum(p.numel() for p in network.parameters()) == pytest.approx(size, rel=0.1)

@@ -23,7 +23,7 @@ def test_a_span_is_the_block_s_silhouette(shape: int, grid: Grid) -> None:
     covered = span(PAPER_CATALOGUE[shape], x, z, grid)
     sums = covered.sum(running_sums(weights))
     for i, place in enumerate(x):
-        picture = silhouette(Stack(np.array([shape]), np.array([[place, 0, z, 0, 0, 0]])), grid=grid)
+        picture = silhouette(Stack(np.array([shape]), np.array([[place, 0, z, 0, 0, 0]])), grid)
         mine = np.zeros_like(picture)
         for row, start, stop in zip(covered.rows, covered.start[i], covered.stop[i], strict=True):
             mine[row, start:stop] = True

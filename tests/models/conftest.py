@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 
 from stackgen._lightning import pl
-from stackgen.data.generation.templates import draw_template, realize
-from stackgen.data.loading.arrays import StackArrays, save_npz
-from stackgen.data.shards import Manifest, Sample
+from stackgen.data.arrays import StackArrays
+from stackgen.data.compact import save_npz
+from stackgen.data.generation.designs import draw_design, realize
+from stackgen.data.manifest import Manifest
+from stackgen.data.shards import Sample
 from stackgen.geometry import silhouette
-from stackgen.models.diffusion.denoiser import DenoiserConfig
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID
+from stackgen.models.transformer import TransformerConfig
+from stackgen.world import PAPER_GRID, PAPER_WORLD
 
-TINY = DenoiserConfig(width=16, layers=1, heads=2, feedforward=32)
-TINY_CROSS = DenoiserConfig(
+TINY = TransformerConfig(width=16, layers=1, heads=2, feedforward=32)
+TINY_CROSS = TransformerConfig(
     width=16, layers=1, heads=2, feedforward=32, conditioning="cross", memory_layers=1, ordered=True
 )
 
@@ -28,20 +30,20 @@ def arrays() -> StackArrays:
     rng = np.random.default_rng(0)
     samples: list[Sample] = []
     while len(samples) < 40:
-        design = draw_template(rng)
-        stack = realize(design, rng)
+        design = draw_design(rng, PAPER_WORLD)
+        stack = realize(design, rng, PAPER_WORLD)
         if len(stack) <= 10:
             meta = {"template": len(samples), "layout": design.key, "removed": []}
             shapes, poses = stack.shapes.astype(np.uint8), stack.poses.astype(np.float32)
-            samples.append(Sample(str(len(samples)), shapes, poses, silhouette(stack), meta))
-    return StackArrays.from_samples(samples)
+            samples.append(Sample(str(len(samples)), shapes, poses, silhouette(stack, PAPER_GRID), meta))
+    return StackArrays.from_samples(samples, PAPER_WORLD)
 
 
 @pytest.fixture(scope="session")
 def compact(arrays: StackArrays, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same as a compact dataset: 32 for training, 8 for validation."""
     path = tmp_path_factory.mktemp("compact") / "small.npz"
-    manifest = Manifest("small", 0, PAPER_CATALOGUE, PAPER_GRID, 10, {"engine": "none"}, {}).to_json()
+    manifest = Manifest("small", 0, PAPER_WORLD, {"engine": "none"}, {})
     save_npz(path, {"train": arrays.select(slice(32)), "validation": arrays.select(slice(32, 40))}, manifest)
     return path
 

@@ -9,19 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from stackgen.data.loading.arrays import StackArrays
 from torch import Tensor, nn
 
 from stackgen._lightning import pl
+from stackgen.data.arrays import StackArrays
 from stackgen.data.datamodule import StackDataModule
 from stackgen.errors import StackgenError
 from stackgen.models.block_list.heads import ChainHead, ClassHead, all_block_lists, number_of_lists
 from stackgen.models.block_list.module import BlockListCNN
-from stackgen.models.block_list.network import BlockListNetwork, CNNConfig, CNNPredictor, Residual
+from stackgen.models.block_list.network import BlockListNetwork, CNNConfig, Residual
+from stackgen.models.block_list.predictor import CNNPredictor
 from stackgen.models.optimization import OptimizerConfig
 from stackgen.models.weights import export_checkpoint
 from stackgen.sampling.methods import load_predictor
-from stackgen.world import PAPER_WORLD, Catalogue, Grid, Shape
+from stackgen.world import PAPER_WORLD, Catalogue, Grid, Shape, World
 from tests.models.conftest import trainer_for
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -54,8 +55,8 @@ def test_a_list_s_class_is_its_place_in_the_table() -> None:
 
 def test_worlds_of_too_many_lists_have_no_classes_but_a_chain() -> None:
     with pytest.raises(StackgenError, match=r"888029 block lists, too many .* set the network's head to chain"):
-        BlockListNetwork(CNNConfig(layers=1, head="classes"), SEVEN, 20, WIDE)
-    head = BlockListNetwork(SMALL, SEVEN, 20, WIDE).out
+        BlockListNetwork(CNNConfig(layers=1, head="classes"), World(SEVEN, WIDE, 20))
+    head = BlockListNetwork(SMALL, World(SEVEN, WIDE, 20)).out
     assert isinstance(head, ChainHead) and head.sizes == (8, 6, 4, 3, 2, 2, 2)
 
 
@@ -194,7 +195,7 @@ def test_predictions_are_the_lists_of_the_best_classes(known: BlockListNetwork) 
 @pytest.mark.parametrize("limit", [np.array([1, 1]), np.array([[1, 1, 1, 1]])])
 def test_an_inventory_of_another_catalogue_is_an_error(limit: np.ndarray) -> None:
     with pytest.raises(StackgenError, match="one count for each of cube, rectangle"):
-        CNNPredictor(BlockListNetwork(SMALL, PAPER_WORLD)).predict(np.ones((1, 64, 64), bool), limit=limit)
+        CNNPredictor(BlockListNetwork(SMALL, PAPER_WORLD), PAPER_WORLD).predict(np.ones((1, 64, 64), bool), limit=limit)
 
 
 # A fit.

@@ -6,32 +6,24 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor, nn
-from torch.nn import functional as F
+from torch import Tensor
 
-from stackgen.errors import StackgenError
-from stackgen.models.diffusion.denoiser import (
+from stackgen.models.diffusion.denoiser import Denoiser
+from stackgen.models.transformer import (
     Attention,
-    Denoiser,
-    DenoiserConfig,
-    EncoderLayer,
-    Patches,
-    attend,
-    ranks,
-    raster_order,
+    TransformerConfig,
     sinusoids,
-    split_heads,
 )
 from stackgen.world import PAPER_WORLD
 
-PAPER = DenoiserConfig(width=32, layers=2, heads=4, feedforward=48)
+PAPER = TransformerConfig(width=32, layers=2, heads=4, feedforward=48)
 MASKED = replace(PAPER, mask_padding=True)
 CROSS = replace(PAPER, conditioning="cross", memory_layers=1, patch=16, stride=8)
 KINDS = {"paper": PAPER, "masked": MASKED, "cross": CROSS}
 BATCH, BLOCKS = 4, 7
 
 
-def made(config: DenoiserConfig) -> Denoiser:
+def made(config: TransformerConfig) -> Denoiser:
     """With every weight drawn, also those that begin at zero."""
     torch.manual_seed(0)
     model = Denoiser(config, PAPER_WORLD).eval()
@@ -70,7 +62,7 @@ def close(a: Tensor, b: Tensor) -> bool:
 
 
 def test_the_paper_s_model_has_the_paper_s_size() -> None:
-    model = Denoiser(DenoiserConfig(), PAPER_WORLD)
+    model = Denoiser(TransformerConfig(), PAPER_WORLD)
     config, d = model.config, 512
     assert (config.width, config.layers, config.heads, config.feedforward) == (512, 6, 8, 2048)
     assert (config.conditioning, config.mask_padding, config.ordered) == ("joint", False, False)
@@ -84,31 +76,6 @@ def test_the_paper_s_model_has_the_paper_s_size() -> None:
     tokens = linear(6, d) + linear(d, d) + 4 * d + 2 * linear(d, d) + linear(256, d) + linear(d, d)
     assert sum(p.numel() for p in model.parameters()) == 6 * layer + tokens + linear(d, 6)
     assert model.encode(torch.zeros(1, 64, 64)).shape == (1, 16, d)
-
-
-def test_an_encoder_layer_is_torch_s_transformer_encoder_layer() -> None:
-    """Post-norm, ReLU, as in Vaswani et al. 2017; also with padding kept out, and with the norm first."""
-    torch.manual_seed(0)
-    x, seen = torch.randn(3, 9, 32), torch.arange(9) < torch.tensor([9, 4, 6])[:, None]
-    for norm_first in (False, True):
-        ours = EncoderLayer(PAPER, norm_first)
-        theirs = nn.TransformerEncoderLayer(32, 4, 48, dropout=0.0, batch_first=True, norm_first=norm_first)
-        pairs = {
-            "self_attn.in_proj_": ours.attention.qkv, "self_attn.out_proj.": ours.attention.out,
-            "linear1.": ours.feedforward[0], "linear2.": ours.feedforward[2],
-            "norm1.": ours.norm1, "norm2.": ours.norm2,
-        }  # fmt: skip
-        theirs.load_state_dict({f"{a}{n}": p for a, part in pairs.items() for n, p in part.named_parameters()})
-        assert close(ours(x, None), theirs(x))
-        assert close(ours(x, seen)[seen], theirs(x, src_key_padding_mask=~seen)[seen])
-
-
-def test_attention_is_torch_s() -> None:
-    q, k, v = (split_heads(torch.randn(2, 5, 12), 3) for _ in range(3))
-    assert q.shape == (2, 3, 5, 4)
-    merged = F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2)
-    assert close(attend(q, k, v, None), merged)
-    assert Attention(12, 3)(torch.randn(2, 5, 12), None).shape == (2, 5, 12)
 
 
 def test_padding_is_zero_vectors_that_the_paper_does_not_mask() -> None:
@@ -125,57 +92,11 @@ def test_padding_is_zero_vectors_that_the_paper_does_not_mask() -> None:
     assert close(tokens[:, :BLOCKS][inputs["mask"]], (poses + shapes + time[:, None])[inputs["mask"]])
 
 
-# Patches.
-
-
-def test_each_patch_is_one_token_row_by_row() -> None:
-    torch.manual_seed(0)
-    patches = Patches(16, 16, 64, 8)
-    blank = patches(torch.zeros(1, 64, 64))
-    for row, column in ((0, 0), (15, 16), (16, 15), (40, 63), (63, 63)):
-        picture = torch.zeros(1, 64, 64)
-        picture[0, row, column] = 1
-        changed = (patches(picture) != blank).any(-1)[0]
-        assert changed.nonzero().flatten().tolist() == [row // 16 * 4 + column // 16]
-
-
-def test_overlapping_patches_share_pixels() -> None:
-    torch.manual_seed(0)
-    patches = Patches(16, 8, 64, 8)
-    blank = patches(torch.zeros(1, 64, 64))
-    assert blank.shape == (1, 49, 8)
-    picture = torch.zeros(1, 64, 64)
-    picture[0, 20, 20] = 1
-    assert (patches(picture) != blank).any(-1).sum() == 4
-
-
-def test_equal_patches_differ_by_their_positions_alone() -> None:
-    torch.manual_seed(0)
-    tokens = Patches(16, 16, 64, 8)(torch.ones(1, 64, 64))
-    plain = tokens - sinusoids(torch.arange(16).float(), 8)
-    assert close(plain, plain[:, :1].expand_as(plain))
-    assert len({tuple(token) for token in tokens[0].tolist()}) == 16
-
-
-@pytest.mark.parametrize(("patch", "stride"), [(80, 16), (16, 7), (10, 10)])
-def test_patches_that_do_not_tile_are_refused(patch: int, stride: int) -> None:
-    with pytest.raises(StackgenError, match="do not tile 64 pixels"):
-        Patches(patch, stride, 64, 8)
-
-
-def test_sinusoids_tell_positions_apart() -> None:
-    waves = sinusoids(torch.arange(51).float(), 32)
-    assert waves.shape == (51, 32)
-    assert close(waves[:, :16] ** 2 + waves[:, 16:] ** 2, torch.ones(51, 16))
-    between = torch.cdist(waves, waves) + torch.eye(51) * 10
-    assert between.min() > 0.1
-
-
 # Symmetries.
 
 
 @pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
-def test_permuted_blocks_get_permuted_estimates(config: DenoiserConfig) -> None:
+def test_permuted_blocks_get_permuted_estimates(config: TransformerConfig) -> None:
     model, inputs = made(config), scene((7, 7, 7, 7))
     order = torch.stack([torch.randperm(BLOCKS) for _ in range(BATCH)])
     shuffled = {
@@ -189,7 +110,7 @@ def test_permuted_blocks_get_permuted_estimates(config: DenoiserConfig) -> None:
 
 
 @pytest.mark.parametrize("config", [MASKED, CROSS], ids=["masked", "cross"])
-def test_ordered_blocks_are_told_apart_within_their_shape_alone(config: DenoiserConfig) -> None:
+def test_ordered_blocks_are_told_apart_within_their_shape_alone(config: TransformerConfig) -> None:
     model, inputs = made(replace(config, ordered=True)), scene((7, 7, 7, 7))
     inputs["shapes"] = torch.tensor([0, 1, 1, 2, 2, 2, 3]).expand(BATCH, -1)
     expected = run(model, inputs)
@@ -203,14 +124,14 @@ def test_ordered_blocks_are_told_apart_within_their_shape_alone(config: Denoiser
 
 
 @pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
-def test_what_stands_at_padding_does_not_matter(config: DenoiserConfig) -> None:
+def test_what_stands_at_padding_does_not_matter(config: TransformerConfig) -> None:
     model, inputs = made(config), scene()
     other = {**inputs, "poses": torch.where(inputs["mask"][..., None], inputs["poses"], torch.tensor(1e3))}
     assert close(run(model, other)[inputs["mask"]], run(model, inputs)[inputs["mask"]])
 
 
 @pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
-def test_masked_padding_may_be_left_out_and_the_paper_s_may_not(config: DenoiserConfig) -> None:
+def test_masked_padding_may_be_left_out_and_the_paper_s_may_not(config: TransformerConfig) -> None:
     model, inputs = made(config), scene((4, 4, 3, 4))
     short = {name: part[:, :4] if part.ndim > 1 else part for name, part in inputs.items()}
     same = close(run(model, short)[short["mask"]], run(model, inputs)[inputs["mask"]])
@@ -218,7 +139,7 @@ def test_masked_padding_may_be_left_out_and_the_paper_s_may_not(config: Denoiser
 
 
 @pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
-def test_one_memory_serves_several_rows(config: DenoiserConfig) -> None:
+def test_one_memory_serves_several_rows(config: TransformerConfig) -> None:
     model, inputs = made(config), scene()
     memory = model.encode(silhouettes()[:2])
     shared = model(**inputs, memory=memory)
@@ -228,7 +149,7 @@ def test_one_memory_serves_several_rows(config: DenoiserConfig) -> None:
 
 
 @pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
-def test_rows_of_a_batch_do_not_see_each_other(config: DenoiserConfig) -> None:
+def test_rows_of_a_batch_do_not_see_each_other(config: TransformerConfig) -> None:
     model, inputs, picture = made(config), scene(), silhouettes()
     whole = run(model, inputs, picture)
     for row in range(BATCH):
@@ -238,7 +159,7 @@ def test_rows_of_a_batch_do_not_see_each_other(config: DenoiserConfig) -> None:
 
 
 @pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
-def test_every_input_matters(config: DenoiserConfig) -> None:
+def test_every_input_matters(config: TransformerConfig) -> None:
     model, inputs = made(config), scene((7, 7, 7, 7))
     base = run(model, inputs)
     for change in (
@@ -252,29 +173,3 @@ def test_every_input_matters(config: DenoiserConfig) -> None:
 
 def test_an_untrained_cross_model_begins_with_zero() -> None:
     assert (run(Denoiser(CROSS, PAPER_WORLD), scene()) == 0).all()
-
-
-# The order of blocks.
-
-
-def test_ranks_count_the_blocks_of_the_same_shape_before() -> None:
-    shapes = torch.randint(0, 4, (20, 10), generator=torch.Generator().manual_seed(0))
-    for row, found in zip(shapes.tolist(), ranks(shapes).tolist(), strict=True):
-        assert found == [row[:i].count(shape) for i, shape in enumerate(row)]
-
-
-def test_raster_order_is_by_shape_then_row_then_x_with_padding_last() -> None:
-    random = torch.Generator().manual_seed(0)
-    shapes = torch.randint(0, 4, (30, 10), generator=random)
-    poses = torch.zeros(30, 10, 6)
-    poses[..., 0] = torch.stack([torch.randperm(10, generator=random) for _ in range(30)]) * 0.4 - 2  # apart
-    poses[..., 2] = torch.randint(0, 4, (30, 10), generator=random) + 0.5 + 0.05 * torch.randn(30, 10).clamp(-2, 2)
-    shapes[:, 6:] = torch.where(torch.arange(30)[:, None] % 2 == 0, -1, shapes[:, 6:])
-    order = raster_order(poses, shapes)
-    for row, places in enumerate(order.tolist()):
-        keys = [
-            (int(shapes[row, i]) % 5, round(float(poses[row, i, 2]) - 0.5), float(poses[row, i, 0])) for i in places
-        ]  # -1 % 5 is last
-        real = sum(shape >= 0 for shape in shapes[row].tolist())
-        assert keys[:real] == sorted(keys[:real]) and all(key[0] == 4 for key in keys[real:])
-        assert sorted(places) == list(range(10))

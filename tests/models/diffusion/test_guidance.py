@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from stackgen.data.loading.arrays import StackArrays
 from torch import Tensor
 
+from stackgen.data.arrays import StackArrays
 from stackgen.errors import StackgenError
 from stackgen.models.diffusion.denoiser import Denoiser
-from stackgen.models.diffusion.network import DiffusionConfig, DiffusionSampler, PoseDiffusion
+from stackgen.models.diffusion.network import DiffusionConfig, PoseDiffusion
+from stackgen.models.diffusion.sampler import DiffusionSampler
 from stackgen.models.diffusion.schedules import ScheduleConfig
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.world import PAPER_WORLD
@@ -22,7 +23,7 @@ class Blind(Denoiser):
     """Estimates the noise that leads to `seeing` where it is shown a silhouette, to `blind` where not."""
 
     def __init__(self, model: PoseDiffusion, seeing: float, blind: float) -> None:
-        super().__init__(TINY)
+        super().__init__(TINY, PAPER_WORLD)
         self.schedule, self.seeing, self.blind = model.schedule, seeing, blind
 
     def encode(self, silhouette: Tensor) -> Tensor:
@@ -43,9 +44,9 @@ def batch(arrays: StackArrays) -> dict[str, Tensor]:
     return arrays.batch(range(12))
 
 
-def model_with(drop_silhouette: float, guidance: float = 1.0) -> PoseDiffusion:
+def model_with(drop_silhouette: float, guidance: float = 1.0, clip: float | None = None) -> PoseDiffusion:
     torch.manual_seed(0)
-    diffusion = DiffusionConfig(drop_silhouette=drop_silhouette, guidance=guidance)
+    diffusion = DiffusionConfig(drop_silhouette=drop_silhouette, guidance=guidance, clip=clip)
     return PoseDiffusion(TINY, ScheduleConfig(steps=STEPS), diffusion, PAPER_WORLD)
 
 
@@ -59,6 +60,18 @@ def test_the_estimate_moves_away_from_what_it_is_without_the_silhouette(
     question = batch["silhouette"], batch["shapes"], batch["mask"], torch.Generator().manual_seed(0)
     found = model.sample(*question, sampler=config)
     assert found == pytest.approx(torch.full_like(found, 0.1 + weight * 0.3), abs=1e-3)
+
+
+def test_guidance_keeps_to_its_interval_and_to_the_bound(batch: dict[str, Tensor]) -> None:
+    model = model_with(0.1, clip=1.0)
+    model.denoiser = Blind(model, seeing=0.0, blind=0.5)
+    question = batch["silhouette"], batch["shapes"], batch["mask"]
+    late, early = (
+        model.sample(*question, torch.Generator().manual_seed(0), SamplerConfig("ddim", guidance=9.0, guided=guided))
+        for guided in ((0.0, 0.3), (0.5, 1.0))
+    )
+    assert late == pytest.approx(torch.full_like(late, -1.0), abs=1e-3)  # (1 - 9) / 2, bounded
+    assert early == pytest.approx(torch.zeros_like(early), abs=2e-3)  # what came after forgot it
 
 
 def test_the_weight_is_the_models_unless_another_is_asked_for() -> None:

@@ -15,18 +15,19 @@ import pytest
 import torch
 
 from stackgen._lightning import pl
+from stackgen.data.arrays import StackArrays
 from stackgen.data.datamodule import StackDataModule
-from stackgen.data.loading.arrays import StackArrays
 from stackgen.errors import StackgenError
-from stackgen.models.diffusion.denoiser import DenoiserConfig
 from stackgen.models.diffusion.module import DDPM
 from stackgen.models.diffusion.network import DiffusionConfig
 from stackgen.models.diffusion.schedules import ScheduleConfig
 from stackgen.models.optimization import OptimizerConfig
+from stackgen.models.transformer import TransformerConfig
 from stackgen.models.weights import export_checkpoint
 from stackgen.protocols import StackSampler
 from stackgen.sampling.methods import load_sampler
 from stackgen.training.callbacks import EMA, RAW_WEIGHTS
+from stackgen.world import PAPER_WORLD
 from tests.conftest import CHILD
 from tests.models.conftest import TINY, TINY_CROSS, trainer_for
 
@@ -35,7 +36,7 @@ pytestmark = pytest.mark.filterwarnings("ignore")
 FAST = OptimizerConfig(learning_rate=3e-3, warmup=2)
 
 
-def module_for(denoiser: DenoiserConfig = TINY_CROSS, **options: Any) -> DDPM:
+def module_for(denoiser: TransformerConfig = TINY_CROSS, **options: Any) -> DDPM:
     pl.seed_everything(0, verbose=False)
     return DDPM(denoiser, ScheduleConfig(), DiffusionConfig(prediction="v"), FAST, **options)
 
@@ -50,7 +51,7 @@ def poses_of(sampler: StackSampler, arrays: StackArrays) -> np.ndarray:
 
 
 @pytest.mark.parametrize("denoiser", [TINY, TINY_CROSS], ids=["paper", "cross"])
-def test_training_lowers_the_loss(denoiser: DenoiserConfig, compact: Path, tmp_path: Path) -> None:
+def test_training_lowers_the_loss(denoiser: TransformerConfig, compact: Path, tmp_path: Path) -> None:
     module, data = module_for(denoiser, draws=4), data_of(compact)
     trainer = trainer_for(tmp_path, max_steps=1)
     trainer.fit(module, data)
@@ -89,7 +90,7 @@ def test_checkpoint_export_and_module_sample_alike(compact: Path, arrays: StackA
     exported: Any = samplers[2]
     assert exported.card["metrics"] == {"stability": 0.5} and exported.card["trained"]["steps"] == 6
     assert exported.card["dataset"]["name"] == "small" == card["dataset"]["name"]
-    assert exported.catalogue == module.catalogue and exported.grid == module.grid and exported.max_blocks == 10
+    assert exported.world == module.world == PAPER_WORLD
 
 
 def test_a_checkpoint_samples_with_the_average(compact: Path, arrays: StackArrays, tmp_path: Path) -> None:
@@ -121,7 +122,7 @@ def test_the_world_comes_from_the_data(tmp_path: Path, compact: Path) -> None:
     trainer_for(tmp_path, max_steps=1).fit(module, data)
     card = module.card()
     assert card["kind"] == "ddpm" and card["max_blocks"] == 10
-    assert card["catalogue"] == data.catalogue.to_json() and card["grid"] == vars(data.grid)
+    assert card["catalogue"] == data.world.catalogue.to_json() and card["grid"] == vars(data.world.grid)
     assert len(card["dataset"]["sha256"]) == 64 and card["dataset"]["physics"] == {"engine": "none"}
 
 

@@ -8,14 +8,15 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 import torch
-from stackgen.data.loading.arrays import StackArrays
 from torch import Tensor
 
+from stackgen.data.arrays import StackArrays
 from stackgen.errors import StackgenError
-from stackgen.models.diffusion.denoiser import DenoiserConfig
-from stackgen.models.diffusion.network import DiffusionConfig, DiffusionSampler, PoseDiffusion
+from stackgen.models.diffusion.network import DiffusionConfig, PoseDiffusion
+from stackgen.models.diffusion.sampler import DiffusionSampler
 from stackgen.models.diffusion.schedules import ScheduleConfig
 from stackgen.models.diffusion.settings import SPACING, SamplerConfig
+from stackgen.models.transformer import TransformerConfig
 from stackgen.stack import shapes_of
 from stackgen.world import PAPER_WORLD
 from tests.models.conftest import TINY, TINY_CROSS
@@ -32,6 +33,7 @@ class Oracle(torch.nn.Module):
         super().__init__()
         self.config, self.parts = model.denoiser.config, (model.schedule, model.config.prediction)
         self.clean = clean + error
+        self.calls = 0
 
     def encode(self, silhouette: Tensor) -> Tensor:
         return torch.zeros(len(silhouette), 1, 1)
@@ -39,6 +41,7 @@ class Oracle(torch.nn.Module):
     def forward(
         self, x: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor, seen: Tensor | None = None
     ) -> Tensor:
+        self.calls += 1
         (schedule, prediction), clean = self.parts, self.clean.repeat_interleave(len(x) // len(self.clean), 0)
         signal, sigma = schedule.signal_and_noise(t)
         noise = (x - signal * clean) / sigma
@@ -55,7 +58,7 @@ class Silent(Oracle):
 
 
 def model_for(
-    prediction: Prediction = "epsilon", denoiser: DenoiserConfig = TINY, clip: float | None = None
+    prediction: Prediction = "epsilon", denoiser: TransformerConfig = TINY, clip: float | None = None
 ) -> PoseDiffusion:
     torch.manual_seed(0)
     model = PoseDiffusion(denoiser, ScheduleConfig(), DiffusionConfig(prediction, clip), PAPER_WORLD)
@@ -128,7 +131,7 @@ def test_every_step_is_drawn_alike(batch: dict[str, Tensor]) -> None:
 
 
 @pytest.mark.parametrize("denoiser", [TINY, TINY_CROSS], ids=["paper", "cross"])
-def test_what_stands_at_padding_costs_nothing(denoiser: DenoiserConfig, batch: dict[str, Tensor]) -> None:
+def test_what_stands_at_padding_costs_nothing(denoiser: TransformerConfig, batch: dict[str, Tensor]) -> None:
     model = model_for(denoiser=denoiser)
     other = {**batch, "poses": torch.where(batch["mask"][..., None], batch["poses"], torch.tensor(9.0))}
     assert not batch["mask"].all()
@@ -187,7 +190,7 @@ def test_a_perfect_predictor_samples_the_truth(
 
 
 @pytest.mark.parametrize("denoiser", [TINY, TINY_CROSS], ids=["paper", "cross"])
-def test_samples_depend_on_the_seed_and_on_nothing_else(denoiser: DenoiserConfig, arrays: StackArrays) -> None:
+def test_samples_depend_on_the_seed_and_on_nothing_else(denoiser: TransformerConfig, arrays: StackArrays) -> None:
     sampler = DiffusionSampler(model_for(denoiser=denoiser), PAPER_WORLD)
     pictures, counts = arrays.images(range(5)), arrays.counts[:5]
 
@@ -237,18 +240,6 @@ def test_scenes_do_not_mix(batch_size: int, arrays: StackArrays) -> None:
             assert stack.poses == pytest.approx(expected.numpy(), abs=2e-3)
 
 
-def test_the_way_from_noise_is_shown_in_cells(arrays: StackArrays) -> None:
-    sampler, seen = DiffusionSampler(model_for(), PAPER_WORLD), {}
-    scenes = sampler.sample_batch(
-        arrays.images([0]), arrays.counts[:1], 2, 0, callback=lambda t, poses: seen.update({t: poses})
-    )
-    assert list(seen) == list(range(50, -1, -1))
-    k = int(arrays.lengths[0])
-    for i, stack in enumerate(scenes[0]):
-        assert seen[0][i, :k] == pytest.approx(stack.poses, abs=1e-6)
-    assert np.abs((seen[50] - MEAN) / STD).mean() == pytest.approx((2 / np.pi) ** 0.5, rel=0.2)  # normal noise
-
-
 # Settings of the sampler.
 
 
@@ -270,17 +261,9 @@ def test_a_perfect_predictor_samples_the_truth_in_every_way(
     model = model_for(prediction)
     batch = {**batch, "poses": torch.where(batch["mask"][..., None], batch["poses"], model.mean)}
     model.denoiser = Oracle(model, normalised(model, batch))  # type: ignore[assignment]
-    seen: dict[int, Tensor] = {}
-    found = model.sample(
-        batch["silhouette"],
-        batch["shapes"],
-        batch["mask"],
-        generator(),
-        lambda t, x: seen.update({t: x}),
-        sampler,
-    )
+    found = model.sample(batch["silhouette"], batch["shapes"], batch["mask"], generator(), sampler)
     assert found == pytest.approx(batch["poses"], abs=2e-3)
-    assert len(seen) == 1 + (sampler.steps or 50)
+    assert model.denoiser.calls == (sampler.steps or 50)
 
 
 def test_settings_change_the_samples_and_their_absence_nothing(arrays: StackArrays) -> None:
@@ -314,11 +297,9 @@ def test_what_the_card_says_of_sampling_holds_unless_overridden() -> None:
         ({"kind": "dpm", "variance": "beta"}, "variance is not for dpm"),
         ({"kind": "dpm", "eta": 1.5}, "0..1"),
         ({"spacing": 0.5}, "1..10"),
-        ({"guidance": 2.0}, "sampler.guide"),
+        ({"guidance": 2.0}, "sampler.guidance"),
         ({"guidance": -1.0}, "must lie in"),
         ({"guided": [0.5, 0.2]}, "two shares"),
-        ({"guide": "no-such-weights"}, "no-such-weights"),
-        ({"guide": "default"}, "another|no diffusion model of the same"),
     ],
 )
 def test_settings_that_cannot_be_are_refused(settings: dict[str, Any], message: str) -> None:
@@ -326,46 +307,7 @@ def test_settings_that_cannot_be_are_refused(settings: dict[str, Any], message: 
         DiffusionSampler(model_for(), PAPER_WORLD, sampler=SamplerConfig(**settings))
 
 
-# Guidance.
-
-
-def samples_of(model: PoseDiffusion, batch: dict[str, Tensor], guide: PoseDiffusion | None, **settings: Any) -> Tensor:
-    config = SamplerConfig("ddim", 10, guide="weak" if guide else None, **settings)
-    return model.sample(batch["silhouette"], batch["shapes"], batch["mask"], generator(), None, config, guide)
-
-
-def test_guidance_moves_away_from_the_weaker_model(batch: dict[str, Tensor]) -> None:
-    """Where the weak model is off by delta, the guided estimate is off by (1 - weight) delta; below 1 towards it."""
-    strong, weak = model_for("v"), model_for("v")
-    batch = {**batch, "poses": torch.where(batch["mask"][..., None], batch["poses"], strong.mean)}
-    clean, delta = normalised(strong, batch), 0.2
-    strong.denoiser = Oracle(strong, clean)  # type: ignore[assignment]
-    weak.denoiser = Oracle(weak, clean, delta)  # type: ignore[assignment]
-    for weight in (0.0, 0.5, 1.0, 1.5, 3.0):
-        found = samples_of(strong, batch, weak, guidance=weight)
-        expected = (clean + (1 - weight) * delta) * strong.std + strong.mean
-        assert found == pytest.approx(expected, abs=5e-3)
-
-
-def test_guidance_keeps_to_its_interval_and_to_the_bound(batch: dict[str, Tensor]) -> None:
-    strong, weak = model_for("v", clip=1.0), model_for("v")
-    clean = torch.zeros(12, 10, 6)
-    strong.denoiser = Oracle(strong, clean)  # type: ignore[assignment]
-    weak.denoiser = Oracle(weak, clean, 0.5)  # type: ignore[assignment]
-    late, early = (
-        (samples_of(strong, batch, weak, guidance=9.0, guided=guided) - strong.mean) / strong.std
-        for guided in ((0.0, 0.3), (0.5, 1.0))
-    )
-    assert late == pytest.approx(torch.full_like(late, -1.0), abs=1e-3)  # (1 - 9) / 2, bounded
-    assert early == pytest.approx(torch.zeros_like(early), abs=2e-3)  # what came after forgot it
-
-
-def test_only_a_model_of_the_same_world_can_guide() -> None:
-    model, other = model_for(), model_for("v", TINY_CROSS)
-    assert model.guided_by(other)  # another network, another target: estimates of the clean poses are alike
-    other.fit_normalization(MEAN, STD * 2)
-    assert not model.guided_by(other)
-    assert not model.guided_by(PoseDiffusion(TINY, ScheduleConfig(steps=20), DiffusionConfig(), PAPER_WORLD))
+# Self-conditioning.
 
 
 def test_the_network_is_shown_its_last_estimate(batch: dict[str, Tensor], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -379,7 +321,7 @@ def test_the_network_is_shown_its_last_estimate(batch: dict[str, Tensor], monkey
         return out
 
     monkeypatch.setattr(model.denoiser, "forward", watched)
-    samples_of(model, batch, None)
+    model.sample(batch["silhouette"], batch["shapes"], batch["mask"], generator(), SamplerConfig("ddim", 10))
     assert shown[0][0] is None and len(shown) == 10
     for (seen, _), (_, before) in zip(shown[1:], shown, strict=False):
         assert (seen == before).all() and before.abs().max() <= 1.5

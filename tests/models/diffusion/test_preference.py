@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,12 @@ from stackgen.data.arrays import StackArrays
 from stackgen.data.datamodule import StackDataModule
 from stackgen.data.preferences import Preferences, prefer
 from stackgen.errors import StackgenError
-from stackgen.models.diffusion.network import DiffusionSampler
 from stackgen.models.diffusion.preference import VerdictTuning
+from stackgen.models.diffusion.sampler import DiffusionSampler
 from stackgen.models.optimization import OptimizerConfig
 from stackgen.protocols import StabilityChecker, Verdict
 from stackgen.sampling.methods import load_sampler
+from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
 from stackgen.world import PAPER_WORLD, Mask
 from tests.conftest import Cli, TinyWeights
@@ -31,7 +33,9 @@ pytestmark = pytest.mark.filterwarnings("ignore")
 class EveryThirdFails:
     """Knows the truth of each scene, and gives it; every third sample comes one cell too high."""
 
-    world, settings, card = PAPER_WORLD, {}, {}
+    world = PAPER_WORLD
+    settings: Mapping[str, Any] = {}
+    card: Mapping[str, Any] = {}
 
     def __init__(self, stacks: StackArrays) -> None:
         self.truths = {stacks.images([i]).tobytes(): i for i in range(len(stacks))}
@@ -54,8 +58,10 @@ class EveryThirdFails:
 class OnTheGround(StabilityChecker):
     """Stable is what touches the ground."""
 
+    physics = Physics()
+
     def check(self, stack: Stack) -> Verdict:
-        """Judge one stack."""
+        """Give the verdict on one stack."""
         stable = bool(stack.poses[:, 2].min() < 0.9)
         return Verdict(stable, np.full(len(stack), not stable), np.zeros(len(stack)), stack)
 

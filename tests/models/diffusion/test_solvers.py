@@ -10,13 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from stackgen.models.diffusion.samplers import Predict, ancestral, multistep
 from stackgen.models.diffusion.schedules import Schedule, ScheduleConfig
+from stackgen.models.diffusion.solvers import Predict, ancestral, multistep
 
 SCHEDULE = Schedule(ScheduleConfig())
 LONG = Schedule(ScheduleConfig(steps=400, beta_end=0.04))
 STEPS = [50, 37, 26, 15, 6]
-SAMPLERS: dict[str, Callable[..., Tensor]] = {
+SOLVERS: dict[str, Callable[..., Tensor]] = {
     "ancestral beta": ancestral,
     "ancestral posterior": partial(ancestral, posterior_variance=True),
     "first order eta 0": multistep,
@@ -34,6 +34,16 @@ def start(*shape: int, seed: int = 1) -> Tensor:
     return torch.randn(*shape, generator=generator(seed), dtype=torch.float64)
 
 
+def watched(predict: Predict, seen: dict[int, Tensor]) -> Predict:
+    """The predictor, keeping every x_t that it is shown."""
+
+    def shown(x: Tensor, t: Tensor) -> Tensor:
+        seen[int(t)] = x
+        return predict(x, t)
+
+    return shown
+
+
 def gaussian(schedule: Schedule, mean: float, std: float) -> Predict:
     """The exact E[x_0 | x_t] where the data are N(mean, std^2)."""
 
@@ -46,7 +56,7 @@ def gaussian(schedule: Schedule, mean: float, std: float) -> Predict:
 
 
 def moments(schedule: Schedule, mean: float, std: float) -> tuple[float, float]:
-    """Mean and variance that the linear recursion of the sampler ends with, from N(0, 1)."""
+    """Mean and variance that the linear recursion of the solver ends with, from N(0, 1)."""
     m, v = 0.0, 1.0
     for t in range(schedule.steps, 0, -1):
         beta, alpha = schedule.beta[t].item(), schedule.alpha[t].item()
@@ -95,9 +105,9 @@ def test_each_step_is_equation_3_of_the_paper(noise_of: Callable[[Tensor, int], 
 
     seen: dict[int, Tensor] = {}
     noise = start(5, 3, 6)
-    end = ancestral(predict, noise, SCHEDULE, generator(9), callback=lambda t, x: seen.update({t: x}))
-    assert list(seen) == list(range(50, -1, -1))
-    assert (seen[50] == noise).all() and (seen[0] == end).all()
+    end = ancestral(watched(predict, seen), noise, SCHEDULE, generator(9))
+    assert list(seen) == list(range(50, 0, -1)) and (seen[50] == noise).all()
+    seen[0] = end
     fresh = generator(9)
     for t in range(50, 0, -1):
         beta, alpha, bar = SCHEDULE.beta[t], SCHEDULE.alpha[t], SCHEDULE.alpha_bar[t]
@@ -111,15 +121,15 @@ def test_the_last_step_adds_no_noise() -> None:
     """It ends with the last estimate of the clean sample, exactly."""
     target = start(4, 2, 6, seed=3)
     for seed in range(3):
-        for sample in SAMPLERS.values():
-            end = sample(lambda x, t: target, start(4, 2, 6), SCHEDULE, generator(seed), STEPS)
+        for solve in SOLVERS.values():
+            end = solve(lambda x, t: target, start(4, 2, 6), SCHEDULE, generator(seed), STEPS)
             torch.testing.assert_close(end, target, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", list(SAMPLERS))
+@pytest.mark.parametrize("name", list(SOLVERS))
 def test_same_generator_same_sample(name: str) -> None:
     predict = gaussian(SCHEDULE, 0, 1)
-    a, b, c = (SAMPLERS[name](predict, start(3, 2, 6), SCHEDULE, generator(seed), STEPS) for seed in (4, 4, 5))
+    a, b, c = (SOLVERS[name](predict, start(3, 2, 6), SCHEDULE, generator(seed), STEPS) for seed in (4, 4, 5))
     assert (a == b).all()
     if name.endswith("eta 0"):
         assert (a == c).all()  # no noise on the way
@@ -142,10 +152,11 @@ def test_eta_one_is_ancestral_sampling_with_the_posterior_s_variance(steps: list
 
 def test_two_steps_of_the_second_order_are_those_of_the_paper_s_algorithm() -> None:
     """DPM-Solver++ (2M), Lu et al. 2022, Algorithm 2, written out with lambda, h and r."""
-    steps, seen = [50, 30, 12, 4], {}
+    steps = [50, 30, 12, 4]
+    seen: dict[int, Tensor] = {}
     noise = start(2, 3, 6)
-    end = multistep(wavy, noise, SCHEDULE, generator(), steps, order=2, callback=lambda t, x: seen.update({t: x}))
-    assert list(seen) == [*steps, 0] and (seen[0] == end).all()
+    end = multistep(watched(wavy, seen), noise, SCHEDULE, generator(), steps, order=2)
+    assert list(seen) == steps
     bar = SCHEDULE.alpha_bar
     lam = 0.5 * (bar / (1 - bar)).log()
     x, last = noise, None
@@ -183,6 +194,6 @@ def test_a_few_steps_of_the_second_order_keep_the_moments_with_fresh_noise_too(e
 
 def test_all_steps_are_those_of_the_schedule() -> None:
     whole = list(range(50, 0, -1))
-    for sample in SAMPLERS.values():
-        a, b = (sample(wavy, start(2, 2, 6), SCHEDULE, generator(), steps) for steps in (None, whole))
+    for solve in SOLVERS.values():
+        a, b = (solve(wavy, start(2, 2, 6), SCHEDULE, generator(), steps) for steps in (None, whole))
         assert (a == b).all()

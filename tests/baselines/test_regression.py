@@ -11,22 +11,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from stackgen.baselines.tran_reg import PoseRegression
-from stackgen.baselines.tran_vae import PoseVAE, VAEConfig
-from stackgen.baselines.transformer import (
-    BlockTokens,
-    PoseNetwork,
-    RegressionConfig,
-    TransformerSampler,
-    Trunk,
-    best_match,
-    shuffled,
-)
+from stackgen.baselines.regression import BlockTokens, PoseRegressor, RegressionConfig, Trunk, best_match, shuffled
+from stackgen.baselines.tran_reg import TranRegNetwork
+from stackgen.baselines.tran_vae import TranVAENetwork, VAEConfig
 from stackgen.errors import StackgenError
-from stackgen.models.diffusion.denoiser import Denoiser, DenoiserConfig, raster_order, sinusoids
+from stackgen.models.diffusion.denoiser import Denoiser
+from stackgen.models.poses import raster_order
+from stackgen.models.sampler import NetworkSampler
+from stackgen.models.transformer import TransformerConfig, sinusoids
 from stackgen.world import PAPER_WORLD
 
-PAPER = DenoiserConfig(width=16, layers=3, heads=2, feedforward=24)
+PAPER = TransformerConfig(width=16, layers=3, heads=2, feedforward=24)
 CROSS = replace(PAPER, conditioning="cross", memory_layers=1, mask_padding=True, ordered=True)
 KINDS = {"paper": PAPER, "masked": replace(PAPER, mask_padding=True), "cross": CROSS}
 RASTER = RegressionConfig()
@@ -44,12 +39,12 @@ def weighted(network: Any) -> Any:
     return network.eval()
 
 
-def regression(config: DenoiserConfig = CROSS, target: RegressionConfig = RASTER) -> PoseRegression:
-    return weighted(PoseRegression(config, target, PAPER_WORLD))
+def regression(config: TransformerConfig = CROSS, target: RegressionConfig = RASTER) -> TranRegNetwork:
+    return weighted(TranRegNetwork(config, target, PAPER_WORLD))
 
 
-def vae(config: DenoiserConfig = CROSS, target: RegressionConfig = RASTER) -> PoseVAE:
-    return weighted(PoseVAE(config, target, VAE, PAPER_WORLD))
+def vae(config: TransformerConfig = CROSS, target: RegressionConfig = RASTER) -> TranVAENetwork:
+    return weighted(TranVAENetwork(config, target, VAE, PAPER_WORLD))
 
 
 def batch_of(lengths: tuple[int, ...] = (7, 5, 6, 3), blocks: int = BLOCKS) -> dict[str, Tensor]:
@@ -84,8 +79,8 @@ def test_tran_reg_is_the_denoiser_without_noisy_poses_and_time() -> None:
     """The paper: the same number of layers and heads, the same widths."""
     with torch.device("meta"):
         denoiser, network = (
-            Denoiser(DenoiserConfig(), PAPER_WORLD),
-            PoseRegression(DenoiserConfig(), RASTER, PAPER_WORLD),
+            Denoiser(TransformerConfig(), PAPER_WORLD),
+            TranRegNetwork(TransformerConfig(), RASTER, PAPER_WORLD),
         )
     without = size(denoiser.pose_embedding) + size(denoiser.time_embedding)
     assert size(network) == size(denoiser) - without
@@ -94,19 +89,21 @@ def test_tran_reg_is_the_denoiser_without_noisy_poses_and_time() -> None:
 def test_tran_vae_has_two_and_four_of_the_layers() -> None:
     with torch.device("meta"):
         denoiser, network = (
-            Denoiser(DenoiserConfig(), PAPER_WORLD),
-            PoseVAE(DenoiserConfig(), RASTER, VAEConfig(), PAPER_WORLD),
+            Denoiser(TransformerConfig(), PAPER_WORLD),
+            TranVAENetwork(TransformerConfig(), RASTER, VAEConfig(), PAPER_WORLD),
         )
     assert (len(network.encoder.layers), len(network.decoder.layers)) == (2, 4)
     assert size(network.encoder) + size(network.decoder) == size(denoiser.layers)
 
 
 @pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
-def test_the_trunk_computes_what_the_denoiser_s_layers_do(config: DenoiserConfig) -> None:
+def test_the_trunk_computes_what_the_denoiser_s_layers_do(config: TransformerConfig) -> None:
     """With the same weights; the condition is to it what time is to the denoiser."""
     denoiser = weighted(Denoiser(replace(config, ordered=False), PAPER_WORLD))
     trunk = Trunk(config, config.layers, conditioned=True)
-    state = {f"norm.{n}": p for n, p in denoiser.final_norm.state_dict().items()} if not trunk.joint else {}
+    state = (
+        {f"norm.{n}": p for n, p in denoiser.final_norm.state_dict().items()} if config.conditioning == "cross" else {}
+    )
     trunk.load_state_dict({**{f"layers.{n}": p for n, p in denoiser.layers.state_dict().items()}, **state})
     batch, t = batch_of(), torch.tensor([1, 13, 28, 50])
     memory = denoiser.encode(batch["silhouette"])
@@ -118,17 +115,17 @@ def test_the_trunk_computes_what_the_denoiser_s_layers_do(config: DenoiserConfig
 
 
 def test_tokens_are_shape_embedding_plus_positional_encoding() -> None:
-    tokens, shapes = BlockTokens(PAPER, 4, 10), torch.tensor([[2, 0, 2]])
+    tokens, shapes = BlockTokens(PAPER, PAPER_WORLD), torch.tensor([[2, 0, 2]])
     assert close(tokens(shapes), tokens.shape_embedding(shapes) + sinusoids(torch.arange(3).float(), 16))
     assert not close(*tokens(shapes)[0, [0, 2]])  # two of one shape are told apart
 
 
 def test_what_only_a_denoiser_has_is_refused() -> None:
     with pytest.raises(StackgenError, match="self_conditioning"):
-        PoseRegression(replace(CROSS, self_conditioning=True), RASTER, PAPER_WORLD)
+        TranRegNetwork(replace(CROSS, self_conditioning=True), RASTER, PAPER_WORLD)
     for layers in (0, 3):
         with pytest.raises(StackgenError, match="encoder_layers"):
-            PoseVAE(CROSS, RASTER, replace(VAE, encoder_layers=layers), PAPER_WORLD)
+            TranVAENetwork(CROSS, RASTER, replace(VAE, encoder_layers=layers), PAPER_WORLD)
 
 
 # Whose target is whose.
@@ -197,7 +194,7 @@ def test_the_error_is_the_mean_over_real_blocks(target: RegressionConfig, loss: 
 
 
 @pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
-def test_padding_does_not_matter_unless_it_is_the_paper_s(config: DenoiserConfig) -> None:
+def test_padding_does_not_matter_unless_it_is_the_paper_s(config: TransformerConfig) -> None:
     network, batch = regression(config), batch_of((4, 4, 3, 4))
     memory = network.silhouette(batch["silhouette"])
     long = network(batch["shapes"], batch["mask"], memory)
@@ -234,10 +231,10 @@ def test_poses_come_back_to_the_blocks_they_are_for() -> None:
 
 @pytest.mark.parametrize("make", [regression, vae])
 @pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
-def test_every_part_learns(config: DenoiserConfig, make: Any) -> None:
+def test_every_part_learns(config: TransformerConfig, make: Any) -> None:
     network = make(config, MATCHED)
     batch = batch_of()
-    losses = network.losses(batch) if isinstance(network, PoseVAE) else (network.loss(batch),)
+    losses = network.losses(batch) if isinstance(network, TranVAENetwork) else (network.loss(batch),)
     torch.cat(losses).sum().backward()
     assert [name for name, p in network.named_parameters() if p.grad is None or not p.grad.abs().sum() > 0] == []
 
@@ -251,7 +248,7 @@ def test_the_divergence_is_the_one_of_gaussians() -> None:
     mean, log_variance = network.encode(poses, shapes, mask, network.silhouette(batch["silhouette"]))
     posterior = torch.distributions.Normal(mean, (0.5 * log_variance).exp())
     expected = torch.distributions.kl_divergence(posterior, torch.distributions.Normal(0.0, 1.0)).sum(-1)
-    assert close(network.losses(batch, seeded()).divergence, expected)
+    assert close(network.losses(batch, seeded())[1], expected)
 
 
 def test_the_posterior_sees_a_stack_and_not_its_padding() -> None:
@@ -292,8 +289,8 @@ def test_the_weight_of_the_divergence_rises_to_its_value() -> None:
 
 @pytest.mark.parametrize("make", [regression, vae])
 @pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
-def test_samplers_keep_to_the_block_list_and_the_seed(config: DenoiserConfig, make: Any) -> None:
-    sampler = TransformerSampler(make(config), PAPER_WORLD, batch=4)
+def test_samplers_keep_to_the_block_list_and_the_seed(config: TransformerConfig, make: Any) -> None:
+    sampler = NetworkSampler(make(config), PAPER_WORLD, batch=4)
     pictures = batch_of()["silhouette"][:3].numpy() > 0.5
     counts = np.array([[2, 1, 0, 1], [0, 3, 1, 0], [10, 0, 0, 0]])
     first, again = (sampler.sample_batch(pictures, counts, 2, seed=3) for _ in range(2))
@@ -314,14 +311,14 @@ def test_samplers_keep_to_the_block_list_and_the_seed(config: DenoiserConfig, ma
     ],
 )
 def test_what_cannot_be_sampled_is_one_line(shape: Any, counts: Any, samples: int, message: str) -> None:
-    sampler = TransformerSampler(regression(), PAPER_WORLD)
+    sampler = NetworkSampler(regression(), PAPER_WORLD)
     with pytest.raises(StackgenError, match=message):
         sampler.sample_batch(np.zeros(shape, bool), np.array(counts), samples, 0)
 
 
 def test_the_raster_order_is_the_denoiser_s() -> None:
     """Ours and the baseline number equal blocks alike, so that only the generative part differs."""
-    network: PoseNetwork = regression()
+    network: PoseRegressor = regression()
     batch = batch_of((7, 7, 7, 7))
     order = raster_order(batch["poses"], batch["shapes"])
     shapes, _, poses = network.scene(batch, seeded())

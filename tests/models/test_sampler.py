@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from stackgen.errors import StackgenError
-from stackgen.models.diffusion.network import DiffusionConfig, DiffusionSampler, PoseDiffusion
+from stackgen.models.diffusion.network import DiffusionConfig, PoseDiffusion
+from stackgen.models.diffusion.sampler import DiffusionSampler
 from stackgen.models.diffusion.schedules import ScheduleConfig
-from stackgen.models.network_sampler import pad_shapes
+from stackgen.models.sampler import pad_shapes
 from stackgen.world import PAPER_WORLD, Mask
 from tests.models.conftest import TINY
 
@@ -28,7 +29,7 @@ def pictures(count: int, size: int = 64) -> Mask:
     ],
 )
 def test_what_cannot_be_sampled_is_refused(silhouettes: Mask, counts: list[list[int]], message: str) -> None:
-    sampler = DiffusionSampler(PoseDiffusion(TINY, ScheduleConfig(), DiffusionConfig(), PAPER_WORLD))
+    sampler = DiffusionSampler(PoseDiffusion(TINY, ScheduleConfig(), DiffusionConfig(), PAPER_WORLD), PAPER_WORLD)
     with pytest.raises(StackgenError, match=message):
         sampler.sample_batch(silhouettes, np.array(counts), 1, 0)
 
