@@ -15,7 +15,6 @@ OLD_NAMES = {
     "stackgen.callbacks.SampleQuality": "stackgen.training.SampleQuality",
     "stackgen.callbacks.StartFrom": "stackgen.training.StartFrom",
     "stackgen.callbacks.Throughput": "stackgen.training.Throughput",
-    "stackgen.commands.protocol.WeightsUnderTest": "stackgen.commands.test.WeightsUnderTest",
     "stackgen.dashboard.CheckpointArtifact": "stackgen.training.CheckpointArtifact",
     "stackgen.dashboard.StepFigures": "stackgen.training.StepMetrics",
     "stackgen.models.cnn.BlockListCNN": "stackgen.models.BlockListCNN",

@@ -1,4 +1,4 @@
-"""Callbacks that every module shares: averaged and compiled weights, quality of samples, throughput."""
+"""Callbacks that every module shares: averaged and compiled weights, and what is logged beside the losses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from stackgen.evaluation.protocol import Scene, batch_seed, check_scenes, scenes
 from stackgen.models.weights import read_weights
 from stackgen.protocols import StabilityChecker, StackSampler, Verdict
 from stackgen.stack import Stack
-from stackgen.training.plots import log_picture, silhouette_sheet
+from stackgen.training.loggers import log_picture
+from stackgen.training.plots import silhouette_sheet
 
 Part = tuple[float, float]
 """A sum, and the weight that it is to be divided by."""
@@ -329,3 +330,28 @@ class Throughput(pl.Callback):
             rate = self._samples * trainer.world_size / (time.perf_counter() - self._since)
             pl_module.log("train/samples_per_second", rate, batch_size=1)
             self._restart()
+
+
+class StepMetrics(pl.Callback):
+    """Log `train/learning_rate` and `train/gradient_norm`, the norm of all gradients together before they are clipped.
+
+    Args:
+        every_n_steps: Steps from one log to the next; by default as often as the trainer logs.
+    """
+
+    def __init__(self, every_n_steps: int | None = None) -> None:
+        if every_n_steps is not None and every_n_steps < 1:
+            raise StackgenError(f"StepMetrics: every_n_steps must be at least 1, got {every_n_steps}")
+        self.every_n_steps = every_n_steps
+
+    def on_before_optimizer_step(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, optimizer: torch.optim.Optimizer
+    ) -> None:
+        """Look at the gradients, now that they are there."""
+        every = self.every_n_steps or max(1, trainer.log_every_n_steps)  # type: ignore[attr-defined]
+        if trainer.global_step % every:
+            return
+        gradients = [p.grad for group in optimizer.param_groups for p in group["params"] if p.grad is not None]
+        norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients))) if gradients else torch.zeros(())
+        metrics = {"train/learning_rate": float(optimizer.param_groups[0]["lr"]), "train/gradient_norm": norm}
+        pl_module.log_dict(metrics, batch_size=1)

@@ -1,17 +1,27 @@
-"""Where training leaves its files: `runs/<name>/version_<n>/{config.yaml, metrics.csv, checkpoints/}`.
+"""Where training leaves its files: `runs/<name>/version_<n>/{config.yaml, run.json, metrics.csv, checkpoints/}`.
 
-What the other verbs find out stands beside it: `runs/<name>/test_<n>/{config.yaml, metrics.json}`.
+What the other verbs find out stands beside it: `runs/<name>/test_<n>/{config.yaml, run.json, metrics.json}`.
 """
 
 from __future__ import annotations
 
+import os
 import re
+import sys
 from itertools import count
 from pathlib import Path
+from typing import Any
 
+from stackgen.data.dataset import Dataset
 from stackgen.errors import StackgenError
+from stackgen.io.files import write_atomically, write_json
+from stackgen.io.provenance import code_version
 
 RUNS = Path("runs")
+
+_FOLDER = "STACKGEN_RUN_FOLDER"  # tells the processes that the first one starts where it writes
+_RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "SLURM_PROCID")
+"""What launchers number processes or machines by; all are 0, where they are set, for the first process alone."""
 
 
 def new_run(name: str, root: Path = RUNS, kind: str = "version") -> Path:
@@ -32,7 +42,38 @@ def new_run(name: str, root: Path = RUNS, kind: str = "version") -> Path:
     raise AssertionError("count() ends never")
 
 
+def new_shared_run(name: str, root: Path, kind: str) -> Path:
+    """Like new_run, in a distributed run: the first process makes the folder, the others are told of it."""
+    if not is_first_process():
+        return Path(os.environ.get(_FOLDER, root / name))  # on another machine they write nothing
+    folder = new_run(name, root, kind)
+    os.environ[_FOLDER] = str(folder)
+    return folder
+
+
+def is_first_process() -> bool:
+    """Tell whether this is the first process of a distributed run, also before Lightning is there to be asked."""
+    return not any(int(os.environ.get(name, 0)) for name in _RANKS)
+
+
+def describe_run(folder: Path, config: str, dataset: Dataset | None) -> dict[str, Any]:
+    """Write down what makes a run, and return what stands in `run.json`: the code, the command and the data.
+
+    Args:
+        folder: Folder of the run.
+        config: Configuration, as YAML.
+        dataset: Dataset that is read, if there is one.
+    """
+    facts: dict[str, Any] = {"code": code_version(), "command": ["stackgen", *sys.argv[1:]]}
+    if dataset is not None:
+        manifest = dataset.manifest
+        facts["dataset"] = {"path": dataset.path, "name": manifest.name, "sha256": manifest.sha256}
+    write_atomically(folder / "config.yaml", config.encode())
+    write_json(folder / "run.json", facts)
+    return facts
+
+
 def config_of(checkpoint: Path) -> Path | None:
-    """The configuration saved beside a run's checkpoints, if the checkpoint still lies there."""
+    """Find the configuration saved beside a run's checkpoints, if the checkpoint still lies there."""
     config = checkpoint.parent.parent / "config.yaml"
     return config if checkpoint.parent.name == "checkpoints" and config.is_file() else None
