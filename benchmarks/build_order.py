@@ -1,7 +1,7 @@
 """In how many stacks every state of the build stands: the paper's order against the safest one.
 
 Draws settled stacks of testset-v1, plans each in the paper's order, in the safest one by statics and in the safest
-one by statics and simulator, and lets PyBullet judge every state afresh: each from its own blocks alone.
+one by statics and simulator, and lets PyBullet check every state: each from its own blocks alone.
 Times are of the process.
 """
 
@@ -17,11 +17,10 @@ import numpy as np
 from rich.progress import track
 
 from benchmarks.common import argument_parser, plain_table, report, start
-from stackgen.data.generation.generate import TESTSET
-from stackgen.data.shards import Manifest
+from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.errors import StackgenError
 from stackgen.evaluation.intervals import clustered_ratio
-from stackgen.robot.planning.order import BuildOrder, TopDownJaws, plan_order
+from stackgen.robot.planning.build_order import BuildOrder, TopDownJaws, plan_order
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.stack import Stack
 
@@ -33,10 +32,10 @@ class Case:
     """One stack in one order.
 
     Args:
-        order: As planned.
-        stands: Each state, judged by the simulator.
-        free: Each block, whether the jaws get it to its place.
-        milliseconds: For planning.
+        order: Order that was planned.
+        stands: Whether each state stands, by the simulator.
+        free: Whether the jaws get each block to its place.
+        milliseconds: Time of planning [ms].
     """
 
     order: BuildOrder
@@ -48,13 +47,13 @@ class Case:
 def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
-    options.add_argument("--number", type=int, default=200, help="stacks")
-    options.add_argument("--seed", type=int, default=0, help="of the draw")
+    options.add_argument("--number", type=int, default=200, help="number of stacks")
+    options.add_argument("--seed", type=int, default=0, help="seed of the draw")
     return options
 
 
 def main() -> None:
-    """Plan, judge, compare."""
+    """Plan, check, compare."""
     options = parser().parse_args()
     if options.number < 1:
         raise StackgenError("--number must be at least 1")
@@ -64,8 +63,8 @@ def main() -> None:
     cases: dict[str, list[Case]] = {name: [] for name in ORDERS}
     for stack in track(standing, "ordering"):
         for name in ORDERS:
-            cases[name].append(judged(stack, name, simulator))
-    figures: dict[str, Any] = {
+            cases[name].append(checked(stack, name, simulator))
+    metrics: dict[str, Any] = {
         "physics": simulator.physics.to_json(),
         "stacks": len(stacks),
         "standing": len(standing),
@@ -74,19 +73,19 @@ def main() -> None:
         "orders": {name: summary(some) for name, some in cases.items()},
         "safest_minus_paper": differences(cases),
     }
-    report("build_order", figures, [table(figures)], options.out)
+    report("build_order", metrics, [table(metrics)], options.out)
 
 
 def drawn(number: int, seed: int) -> list[Stack]:
-    """Settled stacks of the frozen test set."""
-    manifest = Manifest.load(TESTSET)
-    samples = list(manifest.samples(TESTSET, "test"))
+    """Draw settled stacks of the frozen test set."""
+    testset = Dataset.open(TESTSET)
+    samples = list(testset.samples("test"))
     chosen = np.random.default_rng(seed).choice(len(samples), min(number, len(samples)), replace=False)
-    return [samples[i].stack(manifest.catalogue) for i in chosen]
+    return [samples[i].stack(testset.world.catalogue) for i in chosen]
 
 
-def judged(stack: Stack, name: str, simulator: SimulatorChecker) -> Case:
-    """Plan an order and have the simulator judge each of its states."""
+def checked(stack: Stack, name: str, simulator: SimulatorChecker) -> Case:
+    """Plan an order and have the simulator check each of its states."""
     begin = time.process_time()
     if name == "paper":
         order = plan_order(stack, strategy="greedy")
@@ -102,7 +101,7 @@ def judged(stack: Stack, name: str, simulator: SimulatorChecker) -> Case:
 
 
 def summary(cases: Sequence[Case]) -> dict[str, Any]:
-    """Shares of stacks and least margins [deg], with 95 % intervals; each stack is a cluster of its own."""
+    """Estimate shares of stacks and least margins [deg], with 95 % intervals; each stack is a cluster of its own."""
     margins = np.array([case.order.least_margin for case in cases])
     return {
         "every_state_stands": estimate([all(case.stands) for case in cases]),
@@ -120,7 +119,7 @@ def summary(cases: Sequence[Case]) -> dict[str, Any]:
 
 
 def differences(cases: Mapping[str, Sequence[Case]]) -> dict[str, Any]:
-    """Of each safest order from the paper's, paired by stack."""
+    """Compare each safest order with the paper's, paired by stack."""
     base = cases["paper"]
 
     def paired(some: Sequence[Case]) -> dict[str, Any]:
@@ -135,22 +134,22 @@ def differences(cases: Mapping[str, Sequence[Case]]) -> dict[str, Any]:
 
 
 def estimate(values: Any) -> dict[str, float] | None:
-    """Mean with a 95 % interval."""
+    """Estimate a mean with a 95 % interval."""
     numbers = np.asarray(values, dtype=float)
     found = clustered_ratio(numbers, np.ones(len(numbers)))
     return found.to_json() if found else None
 
 
-def table(figures: Mapping[str, Any]) -> Any:
-    """What is printed."""
+def table(metrics: Mapping[str, Any]) -> Any:
+    """Lay out what is printed."""
 
     def share(name: str, what: str) -> str:
-        e = figures["orders"][name][what]
+        e = metrics["orders"][name][what]
         return f"{100 * e['value']:.1f} ({100 * e['low']:.1f} to {100 * e['high']:.1f})"
 
     rows = []
     for name in ORDERS:
-        found = figures["orders"][name]
+        found = metrics["orders"][name]
         margin = found["least_margin_degrees"]
         rows.append(
             [name, *(share(name, what) for what in ("every_state_stands", "both", "called_safe"))]
@@ -166,7 +165,7 @@ def table(figures: Mapping[str, Any]) -> Any:
         "5th percentile",
         "time [ms]",
     )
-    return plain_table(f"{figures['standing']} stacks that stand", headings, rows)
+    return plain_table(f"{metrics['standing']} stacks that stand", headings, rows)
 
 
 if __name__ == "__main__":

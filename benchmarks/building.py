@@ -1,9 +1,9 @@
 """What becomes of generated stacks that a simulated UR5 builds, with and without noise on where the blocks lie.
 
 For each of a number of scenes of testset-v1 the shipped model draws stacks for the true block list until one stands
-and can be planned: some need a third hand on the way. That one is built once for each level of noise. Results are kept
-in a file of lines as they come: the same command again goes on where it was stopped. Intervals are 95 %, by a
-bootstrap over scenes.
+and can be planned: some need a temporary support on the way. That one is built once for each level of noise. Results
+are kept in a file of lines as they come: the same command again continues where it was stopped. Intervals are 95 %,
+by a bootstrap over scenes.
 """
 
 from __future__ import annotations
@@ -23,12 +23,11 @@ import numpy as np
 from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.api import DEFAULT, load
 from stackgen.commands.progress_bar import progress_bar
-from stackgen.data.generation.generate import TESTSET
-from stackgen.data.loading.arrays import load_dataset
+from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.errors import StackgenError
 from stackgen.evaluation.intervals import clustered_ratio
 from stackgen.evaluation.protocol import Scene, scenes_of
-from stackgen.robot.workcell import Cell
+from stackgen.robot.workcell import Workcell
 from stackgen.sampling.alignment import AlignedSampler
 
 TURN = 1.0
@@ -43,13 +42,17 @@ Record = dict[str, Any]
 def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
-    options.add_argument("--number", type=int, default=100, help="scenes")
-    options.add_argument("--noise", type=float, nargs="*", default=[0.0, 1.0, 2.0], help="standard deviations [mm]")
-    options.add_argument("--grasp", choices=("jaws", "fixed"), default="jaws", help="of the blocks")
-    options.add_argument("--seed", type=int, default=0, help="of the scenes, the stacks and the noise")
-    options.add_argument("--weights", default=DEFAULT, help="of the sampler")
-    options.add_argument("--workers", type=int, default=1, help="builds at a time")
-    options.add_argument("--lines", type=Path, default=Path("out/building.jsonl"), help="results as they come")
+    options.add_argument("--number", type=int, default=100, help="number of scenes")
+    options.add_argument(
+        "--noise", type=float, nargs="*", default=[0.0, 1.0, 2.0], help="standard deviations of the places [mm]"
+    )
+    options.add_argument("--grasp", choices=("jaws", "fixed"), default="jaws", help="how blocks are held")
+    options.add_argument("--seed", type=int, default=0, help="seed of the scenes, the stacks and the noise")
+    options.add_argument("--weights", default=DEFAULT, help="weights of the sampler")
+    options.add_argument("--workers", type=int, default=1, help="number of builds at a time")
+    options.add_argument(
+        "--lines", type=Path, default=Path("out/building.jsonl"), help="file for the results as they come"
+    )
     return options
 
 
@@ -58,7 +61,7 @@ def main() -> None:
     options = parser().parse_args()
     if options.number < 1 or options.workers < 1:
         raise StackgenError("--number and --workers must be at least 1")
-    asked = {key: getattr(options, key) for key in ("seed", "weights", "grasp")} | {"cell": asdict(Cell())}
+    asked = {key: getattr(options, key) for key in ("seed", "weights", "grasp")} | {"cell": asdict(Workcell())}
     records = read_lines(options.lines, asked)
     scenes = drawn(options.number, options.seed)
     jobs = [(scene, noise) for scene in scenes for noise in options.noise]
@@ -73,16 +76,16 @@ def main() -> None:
             lines.flush()
             advance(len(records))
     found = [records[scene.name, noise] for scene, noise in jobs]
-    figures: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "scenes": len(scenes),
         "asked": asked,
         "levels": [level(noise, [record for record in found if record["noise"] == noise]) for noise in options.noise],
     }
-    report("building", figures, [summary_table(figures["levels"])], options.out)
+    report("building", metrics, [summary_table(metrics["levels"])], options.out)
 
 
 def read_lines(file: Path, asked: dict[str, Any]) -> dict[tuple[str, float], Record]:
-    """The results that are there already.
+    """Read the results that are there already.
 
     Raises:
         StackgenError: If they were made with other options.
@@ -96,19 +99,20 @@ def read_lines(file: Path, asked: dict[str, Any]) -> dict[tuple[str, float], Rec
 
 
 def drawn(number: int, seed: int) -> list[Scene]:
-    """Scenes of the test set.
+    """Draw scenes of the test set.
 
     Raises:
         StackgenError: If there are not so many.
     """
-    scenes = scenes_of(load_dataset(TESTSET, ("test",))[0]["test"])
+    test_set = Dataset.open(TESTSET)
+    scenes = scenes_of(test_set.split("test"), test_set.world.catalogue)
     if number > len(scenes):
         raise StackgenError(f"--number: there are {len(scenes)} scenes")
     return [scenes[i] for i in np.sort(np.random.default_rng(seed).choice(len(scenes), number, replace=False))]
 
 
 def performed(jobs: Sequence[tuple[Scene, float]], options: argparse.Namespace) -> Iterator[Record]:
-    """The results of some jobs, in their order."""
+    """Yield the results of some jobs, in their order."""
     work: Callable[[tuple[Scene, float]], Record] = partial(
         one, seed=options.seed, weights=options.weights, grasp=options.grasp
     )
@@ -121,32 +125,29 @@ def performed(jobs: Sequence[tuple[Scene, float]], options: argparse.Namespace) 
 
 def one(job: tuple[Scene, float], seed: int, weights: str, grasp: Any) -> Record:
     """Draw a stack for a scene, build it, and say what became of it."""
-    from stackgen.robot.build import build, design
-    from stackgen.robot.planning.plan import plan_build
+    from stackgen.robot.build import build, plan_stack
     from stackgen.robot.simulated.arm import PickNoise
 
     scene, noise = job
-    model, cell = load(weights), Cell()
-    physics = model.physics
-    sampler = AlignedSampler(model.sampler, model.grid)
+    model, workcell = load(weights), Workcell()
+    grid, sampler = model.world.grid, AlignedSampler(model.sampler)
     (stacks,) = sampler.sample_batch(scene.silhouette[None], scene.counts[None], DRAWS, seed)
     number = int(scene.name.partition("-")[0])
     picking = PickNoise(noise / 1e3, math.radians(TURN) if noise else 0.0, seed * 100_003 + number)
     record: Record = {"scene": scene.name, "noise": noise, "refused": [], "report": None}
     for stack in stacks:
         try:
-            wanted = design(stack, cell, physics)
-            plan = plan_build(wanted.stack, wanted.order.blocks, cell, physics)
+            planned = plan_stack(stack, workcell, model.physics)
         except StackgenError as error:
             record["refused"].append(str(error))
             continue
-        result = build(wanted, plan, cell, physics, grasp, picking, target=scene.silhouette, grid=model.grid)
+        result = build(planned, grid, target=scene.silhouette, grasp=grasp, noise=picking)
         return record | {"report": result.to_json()}
     return record
 
 
 def level(noise: float, records: Sequence[Record]) -> dict[str, Any]:
-    """The figures of one level of noise."""
+    """Count up one level of noise."""
     done = [record for record in records if record["report"]]
     reports = [record["report"] for record in done]
     reasons = [why for record in records for why in record["refused"]]
@@ -203,7 +204,7 @@ def _json(estimate: Any) -> dict[str, float] | None:
 
 
 def spread(clusters: Sequence[Sequence[float]], resamples: int = 1000) -> dict[str, dict[str, float]]:
-    """Median and 95th percentile of values that come in clusters, with intervals.
+    """Estimate median and 95th percentile of values that come in clusters, with intervals.
 
     >>> spread([[1.0, 1.0], [1.0]])["median"]
     {'value': 1.0, 'low': 1.0, 'high': 1.0}
@@ -220,7 +221,7 @@ def spread(clusters: Sequence[Sequence[float]], resamples: int = 1000) -> dict[s
 
 
 def summary_table(levels: Sequence[dict[str, Any]]) -> Any:
-    """One column for each level of noise."""
+    """Lay out one column for each level of noise."""
     lines: list[tuple[str, Callable[[dict[str, Any]], str]]] = [
         ("builds", lambda f: str(f["builds"])),
         ("stacks passed over: they fall", lambda f: str(f["refused"]["stacks_that_fall"])),

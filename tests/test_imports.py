@@ -48,6 +48,8 @@ def imported(path: Path, top_level_only: bool = False) -> set[str]:
     for node in nodes:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "require":
+            found |= {str(argument.value) for argument in node.args[:1] if isinstance(argument, ast.Constant)}
         elif isinstance(node, ast.ImportFrom) and node.module:
             assert node.level == 0, f"{path}: imports are absolute here"
             found |= {f"{node.module}.{alias.name}" for alias in node.names}
@@ -82,8 +84,8 @@ def test_every_package_that_is_imported_is_declared_and_the_other_way_round() ->
         "yaml": "pyyaml",
         "lazy_loader": "lazy-loader",
         "pytorch_lightning": "lightning",
-        "ur_analytic_ik": "ur-analytic-ik",
-        **dict.fromkeys(("rtde_control", "rtde_io", "rtde_receive"), "ur-rtde"),
+        "pinocchio": "pin",
+        **dict.fromkeys(("rtde_control", "rtde_io", "rtde_receive", "dashboard_client"), "ur-rtde"),
     }
     used = {name.partition(".")[0] for path in FILES for name in imported(path)}
     used = {distribution.get(name, name) for name in used if name not in sys.stdlib_module_names} - {"stackgen"}
