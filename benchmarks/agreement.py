@@ -19,14 +19,15 @@ from rich.progress import track
 from benchmarks.common import argument_parser, plain_table, report, start
 from benchmarks.simulator import REFERENCE as FINE
 from benchmarks.simulator import Case, testset_stacks, with_noise, without_some
-from stackgen.data.generation.templates import draw_template, realize
+from stackgen.data.generation.designs import draw_design, realize
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette
 from stackgen.sim.checkers import fell
 from stackgen.sim.physics import Physics
 from stackgen.sim.simulator import Simulator
-from stackgen.sim.statics.plane import Certificate, PlaneStatics
+from stackgen.sim.statics.plane import PlaneStatics, StaticsMargins
 from stackgen.stack import Stack
+from stackgen.world import PAPER_GRID, PAPER_WORLD
 
 SLOW = Physics(time_step=1 / 240, solver_iterations=50, watch=4.0, rest_window=8.0)
 """Its window of rest is longer than its watch: it never stops early."""
@@ -54,7 +55,7 @@ def main() -> None:
         "fast": Physics().to_json(),
         "slow": SLOW.to_json(),
         "fine": FINE.to_json(),
-        "certificate": vars(Certificate()),
+        "certificate": vars(StaticsMargins()),
         **count(asked, judged),
     }
     report("agreement", figures, tables(figures), options.out)
@@ -66,7 +67,7 @@ def cases(number: int, seed: int, weights: str) -> Iterator[Case]:
     stacks = testset_stacks()
     some = [stacks[i] for i in rng.integers(len(stacks), size=number)]
     for i, stack in enumerate(some):
-        yield Case("design", i, realize(draw_template(rng), rng))
+        yield Case("design", i, realize(draw_design(rng, PAPER_WORLD), rng, PAPER_WORLD))
         yield Case("removal", i, without_some(stack, rng))
         yield Case("noise of 0.05", i, with_noise(stack, 0.05, rng))
         yield Case("at its limit", i, at_its_limit(stack, rng))
@@ -80,7 +81,7 @@ def at_its_limit(stack: Stack, rng: np.random.Generator) -> Stack:
     keep = np.setdiff1d(np.arange(len(stack)), np.delete(tops, rng.integers(len(tops))))
     stack = Stack(stack.shapes[keep], stack.poses[keep], stack.catalogue)
     block = int(stack.poses[:, 2].argmax())
-    statics = Certificate(inset=0.0, pull=0.0, friction_kept=1.0)
+    statics = StaticsMargins(inset=0.0, pull=0.0, friction_kept=1.0)
     side, poses = rng.choice([-1.0, 1.0]), stack.poses
     for push in np.arange(0.05, 2.0, 0.05):
         pushed = poses.copy()
@@ -94,9 +95,9 @@ def at_its_limit(stack: Stack, rng: np.random.Generator) -> Stack:
 
 def samples(stacks: Sequence[Stack], weights: str, seed: int) -> list[Stack]:
     """A sample of the model for each stack's silhouette and blocks."""
-    from stackgen.models.weights import load_sampler
+    from stackgen.sampling.methods import load_sampler
 
-    pictures = np.stack([silhouette(stack) for stack in stacks])
+    pictures = np.stack([silhouette(stack, PAPER_GRID) for stack in stacks])
     counts = np.stack([stack.counts for stack in stacks])
     return [row[0] for row in load_sampler(weights).sample_batch(pictures, counts, 1, seed)]
 
@@ -108,19 +109,19 @@ def judge(case: Case) -> dict[str, Any]:
     answer["fine"] = falls(FINE, until_fall=True)
     answer["statics"] = "not asked"
     if case.source == "removal":  # parts of settled stacks: what the generator asks statics about
-        statics = PlaneStatics(case.stack, Physics().friction, Certificate())
+        statics = PlaneStatics(case.stack, Physics().friction, StaticsMargins())
         answer["statics"] = statics.outcome(np.arange(len(case.stack)))
     return answer
 
 
 def _falls(stack: Stack, physics: Physics, until_fall: bool = False) -> bool:
-    world = _WORLDS.setdefault(physics, Simulator(physics))
-    return bool(fell(world.rollout(stack, until_fall=until_fall), physics).any())
+    simulator = _SIMULATORS.setdefault(physics, Simulator(physics))
+    return bool(fell(simulator.rollout(stack, until_fall=until_fall), physics).any())
 
 
 COUNTED = ("number", "fall", "fast_slow", "fast_fine", "slow_fine", "certain", "certain_wrong")
 
-_WORLDS: dict[Physics, Simulator] = {}
+_SIMULATORS: dict[Physics, Simulator] = {}
 
 
 def disputed(answer: dict[str, Any]) -> bool:

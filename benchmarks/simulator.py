@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common import argument_parser, peak_rss_mb, plain_table, report, start
-from stackgen.data.generation.generate import TESTSET
-from stackgen.data.generation.templates import draw_template, realize
-from stackgen.data.shards import Manifest
+from stackgen.data.dataset import TESTSET, Dataset
+from stackgen.data.generation.designs import draw_design, realize
 from stackgen.errors import StackgenError
 from stackgen.sim.checkers import AcceptLimits, accept, fell
 from stackgen.sim.physics import Physics
 from stackgen.sim.simulator import Rollout, Simulator
 from stackgen.stack import Stack
+from stackgen.world import PAPER_WORLD
 
 REFERENCE = Physics(time_step=1 / 960, solver_iterations=200, rest_window=0.25, rest_motion=2e-4, watch=4.0)
 """Twice the steps, three times the iterations, four times the window with a stricter rest, twice the watch.
@@ -76,8 +76,8 @@ def main() -> None:
 
 def testset_stacks() -> list[Stack]:
     """The frozen scenes' stacks, read without torch: the peak of memory is the simulator's."""
-    manifest = Manifest.load(TESTSET)
-    return [sample.stack(manifest.catalogue) for sample in manifest.samples(TESTSET, "test")]
+    testset = Dataset.open(TESTSET)
+    return [sample.stack(testset.world.catalogue) for sample in testset.samples("test")]
 
 
 def timed(name: str, stacks: Sequence[Stack], until_fall: bool) -> dict[str, Any]:
@@ -105,7 +105,7 @@ def cases(stacks: Sequence[Stack], number: int, noise: float, rng: np.random.Gen
     for i in range(number):
         stack = stacks[int(rng.integers(len(stacks)))]
         if i % 3 == 0:
-            found.append(Case("template", i, realize(draw_template(rng), rng)))
+            found.append(Case("template", i, realize(draw_design(rng, PAPER_WORLD), rng, PAPER_WORLD)))
         elif i % 3 == 1:
             found.append(Case("removal", i, without_some(stack, rng)))
         else:

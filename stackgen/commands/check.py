@@ -1,4 +1,4 @@
-"""stackgen check: which structures of a file stand, which fall."""
+"""stackgen check: which structures of a file stand, and which fall."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from stackgen.api import judge
+from stackgen.api import check
 from stackgen.commands.parsing import Command, Files
-from stackgen.commands.tables import add_entries, verdict_table
+from stackgen.commands.verdict_table import FALLS, STANDS, verdict_table
 from stackgen.io.stacks_file import StackEntry, read_stacks, write_stacks
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
@@ -24,55 +24,48 @@ def main(
     explain: bool = False,
     physics: Physics = Physics(),  # noqa: B008 - it is frozen
 ) -> int:
-    """Simulate the structures of a stacks file and say which stand; exit code 1 if any falls.
+    """Simulate the structures of a stacks file and say which stand; the exit code is 1 if any falls.
 
     Args:
-        file: A stacks.json, hand-written ones too.
-        out: Write the file again here, with verdicts and settled poses; with --explain also with margins.
-        explain: Also ask an equilibrium check, and say why blocks cannot be held.
-        physics: Of the simulation; friction and whatever else makes the world are the file's unless given.
+        file: A stacks.json, made by stackgen or written by hand.
+        out: File to write the stacks to, with verdicts and settled poses, and with --explain also margins.
+        explain: Whether to ask statics, too, and to say why blocks cannot be held.
+        physics: Numbers of the simulation; what is not given is as in the file, as far as it describes the blocks.
     """
     content = read_stacks(file)
-    physics = replace(Physics.of_world(content.physics, physics), cell_size=content.cell_size)
-    checker = SimulatorChecker(physics, content.world.catalogue)
-    judged = replace(
-        content,
-        entries=tuple(
-            replace(judge(checker, entry.stack, content.target, content.world.grid), comment=entry.comment)
-            for entry in content.entries
-        ),
-        physics=physics.to_json(),
+    physics = replace(Physics.recorded(content.physics, physics), cell_size=content.cell_size)
+    checker = SimulatorChecker(physics)
+    entries = tuple(
+        replace(check(checker, entry.stack, content.target, content.world.grid), comment=entry.comment)
+        for entry in content.entries
     )
-    table = verdict_table("file")
-    add_entries(table, file.name, judged.entries)
-    Console().print(table)
+    Console().print(verdict_table("file", [(file.name, entries)]))
     if explain:
-        entries, statics = _explained(judged.entries, physics)
-        judged = replace(judged, entries=entries)
+        entries, statics = _explained(entries, physics)
         Console().print("", statics, sep="\n")
     if out is not None:
-        write_stacks(out, judged)
-    return 0 if all(entry.verdict and entry.verdict.stable for entry in judged.entries) else 1
+        write_stacks(out, replace(content, entries=entries, physics=physics.to_json()))
+    return 0 if all(entry.verdict and entry.verdict.stable for entry in entries) else 1
 
 
 def _explained(entries: Sequence[StackEntry], physics: Physics) -> tuple[tuple[StackEntry, ...], Table]:
-    """The entries with margins, and what statics says of each beside the simulator's verdict."""
-    from stackgen.sim.statics.checker import EquilibriumChecker  # loads a solver that nothing else needs
+    """Add margins to the entries, and make a table of what statics says of each beside the simulator's verdict."""
+    from stackgen.sim.statics.checker import StaticsChecker  # loads a solver that nothing else needs
 
-    checker = EquilibriumChecker(physics)
+    checker = StaticsChecker(physics)
     table = Table("stack", "simulator", "statics", "margin", "push", "what cannot be held", box=None, pad_edge=False)
     for column in (table.columns[0], *table.columns[3:5]):
         column.justify = "right"
     explained = []
     for number, entry in enumerate(entries, 1):
-        found = checker.equilibrium(entry.stack, with_push=True)
+        found = checker.answer(entry.stack, with_push=True)
         reasons = checker.reasons(entry.stack, found)
         verdict = entry.verdict and replace(entry.verdict, margin=found.margin)
         explained.append(replace(entry, verdict=verdict))
         table.add_row(
             str(number),
-            _word(bool(verdict and verdict.stable)),
-            _word(found.stable),
+            STANDS if verdict and verdict.stable else FALLS,
+            STANDS if found.stable else FALLS,
             f"{math.degrees(found.margin):.1f}°",
             "" if found.push is None else f"{found.push:.0%}",
             "; ".join(f"block {i} ({entry.stack.names[i]}): {why}" for i, why in reasons.items()),
@@ -80,20 +73,16 @@ def _explained(entries: Sequence[StackEntry], physics: Physics) -> tuple[tuple[S
     return tuple(explained), table
 
 
-def _word(stands: bool) -> str:
-    return "[green]stands[/]" if stands else "[red]falls[/]"
-
-
 COMMAND = Command(
     "check",
     main,
     """
     stackgen check out/arch/stacks.json
-    stackgen check mine.json --out judged.json --physics.friction 0.3
+    stackgen check mine.json --out checked.json --physics.friction 0.3
     stackgen check examples/stacks/cantilever.json --explain
     """,
     files=Files("file", "FILE", "A stacks.json."),
-    flags={"explain": "Also ask an equilibrium check: margins, and why blocks cannot be held."},
+    flags={"explain": "Also ask statics for margins, and why blocks cannot be held."},
 )
 
 

@@ -1,4 +1,4 @@
-"""Two questions to one rollout: may it be data (accept), and did a block fall (fell)?"""
+"""Two questions to one rollout: is the stack good enough to be data (accept), and did a block fall (fell)?"""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from stackgen.protocols import Verdict
 from stackgen.sim.physics import Physics
 from stackgen.sim.simulator import Rollout, Simulator
 from stackgen.stack import Stack
-from stackgen.world import PAPER_CATALOGUE, Catalogue
 
 
 @dataclass(frozen=True)
@@ -21,8 +20,8 @@ class AcceptLimits:
     """How far a stack may settle and still be called the stack that was put down.
 
     Args:
-        displacement: Of any block's centre along any axis [cell].
-        tilt: Of any block away from the vertical it started with [rad].
+        displacement: Largest displacement of a block's centre along an axis [cell].
+        tilt: Largest change of the angle between a block and the vertical [rad].
     """
 
     displacement: float = 0.2
@@ -30,14 +29,14 @@ class AcceptLimits:
 
 
 def accept(rollout: Rollout, limits: AcceptLimits) -> bool:
-    """Whether a rollout makes its settled stack good enough to be data: at rest, near where it began, upright."""
+    """Tell whether the settled stack is good enough to be data: at rest, near where it began, upright."""
     moved = np.abs(rollout.end.poses[:, :3] - rollout.start.poses[:, :3]).max(initial=0)
     leaned = np.abs(tilt(rollout.end.poses) - tilt(rollout.start.poses)).max(initial=0)
     return bool(rollout.at_rest and moved <= limits.displacement and leaned <= limits.tilt)
 
 
 def fell(rollout: Rollout, physics: Physics) -> NDArray[np.bool_]:
-    """(k,) which blocks fell to a layer below where they began (paper, "Evaluation in simulation")."""
+    """Tell which blocks (k,) fell to a layer below where they began (paper, "Evaluation in simulation")."""
     return rollout.drop > physics.fall_height
 
 
@@ -45,29 +44,26 @@ class SimulatorChecker:
     """A StabilityChecker that asks PyBullet.
 
     Args:
-        physics: Its numbers; the project's own by default.
-        catalogue: The shapes of the stacks to come.
+        physics: Numbers of the physics; the project's own by default.
         until_fall: End a rollout at the first fall: the same verdicts, sooner; but the settled
             poses of unstable stacks are then those of that moment.
     """
 
-    def __init__(
-        self, physics: Physics | None = None, catalogue: Catalogue = PAPER_CATALOGUE, until_fall: bool = False
-    ) -> None:
-        self.simulator = Simulator(physics, catalogue)
+    def __init__(self, physics: Physics | None = None, until_fall: bool = False) -> None:
+        self.simulator = Simulator(physics)
         self.until_fall = until_fall
 
     @property
     def physics(self) -> Physics:
-        """The numbers its verdicts hold for."""
+        """The numbers that its verdicts hold for."""
         return self.simulator.physics
 
     def check(self, stack: Stack) -> Verdict:
-        """Judge one stack."""
+        """Give the verdict on one stack."""
         rollout = self.simulator.rollout(stack, until_fall=self.until_fall)
         fallen = fell(rollout, self.physics)
         return Verdict(not fallen.any(), fallen, rollout.drop, rollout.end, rollout.at_rest)
 
     def check_all(self, stacks: Iterable[Stack]) -> list[Verdict]:
-        """Judge many."""
+        """Give the verdicts on many stacks, in order."""
         return [self.check(stack) for stack in stacks]

@@ -1,7 +1,7 @@
 """The numbers of the physics, in one place.
 
-A verdict means nothing without them: they travel in every dataset manifest, weights card,
-`stacks.json` and report.
+A verdict means nothing without them: every dataset manifest, weights card, `stacks.json` and report
+carries them.
 """
 
 from __future__ import annotations
@@ -11,30 +11,30 @@ from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
-_OF_THE_WORLD = ("cell_size", "friction", "density", "gravity", "fall_height")
+_TAKEN_OVER = ("cell_size", "friction", "density", "gravity", "fall_height")
 
 
 @dataclass(frozen=True)
 class Physics:
-    """How a stack is simulated and watched.
+    """Numbers by which a stack is simulated and watched.
 
     Args:
         cell_size: Edge of a cube [m].
         friction: Coulomb coefficient between any two surfaces.
-        density: Of every block [kg/m^3].
-        gravity: [m/s^2].
-        time_step: [s].
-        solver_iterations: Of Bullet's sequential-impulse solver, per step. Few iterations at a long
-            step leave the contacts unsolved: a standing tower then creeps and never rests (at 240 Hz
+        density: Density of every block [kg/m^3].
+        gravity: Acceleration of gravity [m/s^2].
+        time_step: Step of the simulation [s].
+        solver_iterations: Iterations of Bullet's sequential-impulse solver per step. Few iterations at a
+            long step leave the contacts unsolved: a standing tower then creeps and never rests (at 240 Hz
             and 20 iterations 7 of 8 did); at 480 Hz and 60 it rests at once, and needs fewer steps.
-        solver_residual: The solver stops iterating below this squared residual.
-        contact_threshold: Bullet keeps a contact point until its faces are further apart than this [m].
-        watch: A stack is watched for at most this long [s].
-        rest_window: A stack is at rest once no block moved more than `rest_motion` [cell] within
-            this time [s]; the rollout then ends.
-        rest_motion: See `rest_window` [cell].
-        fall_height: A block fell when its centre dropped by more than this [cell] (SPEC: half a
-            cell, "to a layer below where it began").
+        solver_residual: Squared residual below which the solver stops iterating.
+        contact_threshold: Distance between faces up to which Bullet keeps a contact point [m].
+        watch: Longest time for which a stack is watched [s].
+        rest_window: Time within which no block of a stack at rest moves more than `rest_motion` [s]; the
+            rollout then ends.
+        rest_motion: Largest motion of a block at rest [cell].
+        fall_height: Drop of its centre from which on a block fell [cell] (SPEC: half a cell, "to a layer
+            below where it began").
     """
 
     cell_size: float = 0.05
@@ -51,30 +51,30 @@ class Physics:
     fall_height: float = 0.5
 
     @staticmethod
-    def of_world(made: Mapping[str, Any] | None, given: Physics | None = None) -> Physics:
-        """The physics of the world that something was made in, simulated as this version does.
+    def recorded(made: Mapping[str, Any] | None, given: Physics | None = None) -> Physics:
+        """Return the physics that something was made with, simulated as this version does.
 
-        What blocks are and what counts as a fall belong to a world; step, solver and watch to the simulator.
+        What blocks are and what counts as a fall are taken over; step, solver and watch are the simulator's own.
 
         Args:
-            made: A manifest's, card's or stacks file's physics, in plain form; None for the project's own.
-            given: Its settings that are not the defaults win.
+            made: Physics of a manifest, card or stacks file, in plain form; None for the project's own.
+            given: Physics whose settings that are not the defaults win.
 
-        >>> physics = Physics.of_world({"friction": 0.3, "fall_height": 0.25, "watch": 9.0}, Physics(friction=0.4))
+        >>> physics = Physics.recorded({"friction": 0.3, "fall_height": 0.25, "watch": 9.0}, Physics(friction=0.4))
         >>> physics.friction, physics.fall_height, physics.watch
         (0.4, 0.25, 2.0)
         """
-        own = {name: made[name] for name in _OF_THE_WORLD if name in made} if made else {}
+        own = {name: made[name] for name in _TAKEN_OVER if name in made} if made else {}
         changed = {k: v for k, v in asdict(given or Physics()).items() if v != getattr(Physics(), k)}
         return Physics(**{**own, **changed})
 
     def to_json(self) -> dict:
-        """Plain form with the engine's name and version, for manifests and reports."""
+        """Return the plain form, with the engine's name and version, for manifests and reports."""
         return {"engine": engine_version(), **asdict(self)}
 
 
 def engine_version() -> str:
-    """Name and version of the engine, `pybullet absent` where it is not installed."""
+    """Return name and version of the engine, `pybullet absent` where it is not installed."""
     try:
         return f"pybullet {version('pybullet')}"
     except PackageNotFoundError:

@@ -1,9 +1,9 @@
-"""A PyBullet world: put a stack down, let time pass, say where the blocks went.
+"""PyBullet: put a stack down, let time pass, say where the blocks went.
 
-One world serves for any number of stacks, since opening one costs 25 ms and 34 MB: the blocks of the
-last rollout are removed, which drops their contacts, and new ones are created in an order of their
-own. Overlapping pairs are sorted. So a rollout depends on the stack alone: not on what was simulated
-before, nor on the order of its blocks (tests/sim).
+One client of PyBullet serves for any number of stacks, since opening one costs 25 ms and 34 MB: the
+blocks of the last rollout are removed, which drops their contacts, and new ones are created in an order
+of their own. Overlapping pairs are sorted. So a rollout depends on the stack alone: not on what was
+simulated before, nor on the order of its blocks (tests/sim).
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -22,7 +22,9 @@ from scipy.spatial.transform import Rotation
 
 from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
-from stackgen.world import PAPER_CATALOGUE, Catalogue, Shape
+from stackgen.world import Shape
+
+Floats = NDArray[np.float64]
 
 
 @contextlib.contextmanager
@@ -46,30 +48,30 @@ with _quiet():
 
 @dataclass(frozen=True)
 class Rollout:
-    """What the simulator saw.
+    """What the simulator saw of a stack.
 
     Args:
         start: The stack as it was put down.
         end: The stack when the rollout ended.
         at_rest: Whether it ended because nothing moved any more.
         time: Simulated time [s].
-        trajectory: (frames, k, 6) poses on the way, when asked for; the first frame is the start.
+        trajectory: (frames, k, 6) poses on the way, the first those of the start; None if they were not recorded.
     """
 
     start: Stack
     end: Stack
     at_rest: bool
     time: float
-    trajectory: NDArray[np.float64] | None = None
+    trajectory: Floats | None = None
 
     @property
-    def drop(self) -> NDArray[np.float64]:
-        """(k,) how far each block's centre sank [cell]."""
+    def drop(self) -> Floats:
+        """How far each block's centre sank [cell], (k,)."""
         return self.start.poses[:, 2] - self.end.poses[:, 2]
 
 
 class Simulator:
-    """Simulates stacks of one catalogue under one physics.
+    """Simulates stacks under one physics.
 
     >>> with Simulator() as simulator:
     ...     rollout = simulator.rollout(Stack([0], [[0, 0, 0.5, 0, 0, 0]]))
@@ -77,10 +79,9 @@ class Simulator:
     True
     """
 
-    def __init__(self, physics: Physics | None = None, catalogue: Catalogue = PAPER_CATALOGUE) -> None:
+    def __init__(self, physics: Physics | None = None) -> None:
         self.physics = physics or Physics()
-        self.catalogue = catalogue
-        self._world: _World | None = None
+        self._client: _Client | None = None
 
     def rollout(
         self, stack: Stack, *, until_fall: bool = False, until_moved: float = np.inf, record_every: int = 0
@@ -88,25 +89,25 @@ class Simulator:
         """Spawn a stack at its poses and watch it until it rests or the watch is over.
 
         Args:
-            stack: Of this simulator's catalogue.
+            stack: The stack.
             until_fall: End as soon as a block fell: enough for a verdict, and much faster.
             until_moved: End as soon as a block moved further than this from its start [cell].
             record_every: Keep every n-th step's poses in the trajectory; 0 keeps none.
         """
-        if self._world is None:
-            self._world = _World(self.catalogue, self.physics)
+        if self._client is None:
+            self._client = _Client(self.physics)
         order = np.lexsort((*stack.poses.T, stack.shapes))  # the order of the blocks must not matter
-        self._world.put(stack.shapes[order], stack.poses[order])
-        poses, at_rest, steps, frames = self._world.run(until_fall, until_moved, record_every)
+        self._client.put([stack.catalogue[shape] for shape in stack.shapes[order]], stack.poses[order])
+        poses, at_rest, steps, frames = self._client.run(until_fall, until_moved, record_every)
         back = np.argsort(order)
         trajectory = np.array([frame[back] for frame in frames]) if record_every else None
         return Rollout(stack, stack.with_poses(poses[back]), at_rest, steps * self.physics.time_step, trajectory)
 
     def close(self) -> None:
-        """Give the world's memory back; the simulator stays usable."""
-        if self._world is not None:
-            bullet.disconnect(self._world.client)
-            self._world = None
+        """Give PyBullet's memory back; the simulator stays usable."""
+        if self._client is not None:
+            bullet.disconnect(self._client.number)
+            self._client = None
 
     def __enter__(self) -> Simulator:
         return self
@@ -115,36 +116,38 @@ class Simulator:
         self.close()
 
 
-class _World:
+class _Client:
     """The PyBullet side of a simulator: metres inside, cells outside."""
 
-    def __init__(self, catalogue: Catalogue, physics: Physics) -> None:
+    def __init__(self, physics: Physics) -> None:
         self.physics = physics
-        self.client = connect(physics)
-        self.molds = [Mold.cast(shape, physics, self.client) for shape in catalogue]
-        self.centers = np.array([shape.center_of_mass for shape in catalogue])
+        self.number = connect(physics)
+        self.molds: dict[Shape, Mold] = {}
         self.bodies: list[int] = []
 
-    def put(self, shapes: NDArray[np.int64], poses: NDArray[np.float64]) -> None:
+    def put(self, shapes: Sequence[Shape], poses: Floats) -> None:
         """Clear the ground and spawn blocks."""
         for body in self.bodies:
-            bullet.removeBody(body, physicsClientId=self.client)
+            bullet.removeBody(body, physicsClientId=self.number)
         # A variable of the whole process in Bullet: another physics may have set it meanwhile.
         threshold = self.physics.contact_threshold
-        bullet.setPhysicsEngineParameter(contactBreakingThreshold=threshold, physicsClientId=self.client)
+        bullet.setPhysicsEngineParameter(contactBreakingThreshold=threshold, physicsClientId=self.number)
         self.start = poses
-        self.com = self.centers[shapes]  # in the block frame [cell]
+        self.com = np.array([shape.center_of_mass for shape in shapes]).reshape(-1, 3)  # in the block frame [cell]
         rotation = Rotation.from_rotvec(poses[:, 3:])
         positions = (poses[:, :3] + rotation.apply(self.com)) * self.physics.cell_size
         self.bodies = [
-            self.molds[shape].spawn(position, quaternion, self.client)
+            self._mold(shape).spawn(position, quaternion, self.number)
             for shape, position, quaternion in zip(shapes, positions.tolist(), rotation.as_quat().tolist(), strict=True)
         ]
 
-    def run(
-        self, until_fall: bool, until_moved: float, record_every: int
-    ) -> tuple[NDArray[np.float64], bool, int, list[NDArray[np.float64]]]:
-        """Final poses (k, 6), at rest, steps taken, recorded frames."""
+    def _mold(self, shape: Shape) -> Mold:
+        if shape not in self.molds:
+            self.molds[shape] = Mold.cast(shape, self.physics, self.number)
+        return self.molds[shape]
+
+    def run(self, until_fall: bool, until_moved: float, record_every: int) -> tuple[Floats, bool, int, list[Floats]]:
+        """Let time pass; return the final poses (k, 6), whether all rests, the steps taken and the recorded frames."""
         physics = self.physics
         window = max(1, round(physics.rest_window / physics.time_step))
         look = max(1, window // 5)
@@ -156,7 +159,7 @@ class _World:
         arm = np.linalg.norm(self.com, axis=1).max(initial=0)
         stir = min(until_moved, physics.fall_height if until_fall else np.inf) / (1 + 10 * arm)
         for step in range(1, max(1, round(physics.watch / physics.time_step)) + 1):
-            bullet.stepSimulation(physicsClientId=self.client)
+            bullet.stepSimulation(physicsClientId=self.number)
             if record_every and step % record_every == 0:
                 frames.append(self._poses(self._states()))
             if step % look:
@@ -174,21 +177,21 @@ class _World:
                 return self._poses(state), True, step, frames
         return self._poses(self._states()), False, step, frames
 
-    def _states(self) -> NDArray[np.float64]:
-        """(k, 7) centres of mass [cell] and quaternions."""
-        states = [bullet.getBasePositionAndOrientation(b, physicsClientId=self.client) for b in self.bodies]
+    def _states(self) -> Floats:
+        """Read centres of mass [cell] and quaternions, (k, 7)."""
+        states = [bullet.getBasePositionAndOrientation(b, physicsClientId=self.number) for b in self.bodies]
         array = np.array([position + quaternion for position, quaternion in states]).reshape(-1, 7)
         array[:, :3] /= self.physics.cell_size
         return array
 
-    def _poses(self, states: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(k, 6) poses of the block frames [cell, rad]."""
+    def _poses(self, states: Floats) -> Floats:
+        """Convert states (k, 7) to poses (k, 6) of the block frames [cell, rad]."""
         rotation = Rotation.from_quat(states[:, 3:])
         return np.concatenate([states[:, :3] - rotation.apply(self.com), rotation.as_rotvec()], axis=1)
 
 
 def connect(physics: Physics, mode: int = bullet.DIRECT) -> int:
-    """Open a world with gravity, ground and the solver settings; returns its client id."""
+    """Open a client of PyBullet with gravity, ground and the solver's settings; return its number."""
     client = bullet.connect(mode)
     bullet.setGravity(0, 0, -physics.gravity, physicsClientId=client)
     bullet.setPhysicsEngineParameter(
@@ -207,7 +210,7 @@ def connect(physics: Physics, mode: int = bullet.DIRECT) -> int:
 
 @dataclass(frozen=True)
 class Mold:
-    """What blocks of one shape have in common in one world: collision shape, mass and surface."""
+    """What the blocks of one shape have in common in one client: collision shape, mass and surface."""
 
     collision: int
     mass: float
@@ -229,14 +232,14 @@ class Mold:
         return Mold(collision, mass, dynamics)
 
     def spawn(self, position: list[float], quaternion: list[float], client: int) -> int:
-        """Add a block with its centre of mass at `position` [m]; returns its body id."""
+        """Add a block with its centre of mass at `position` [m]; return the number of its body."""
         body = bullet.createMultiBody(self.mass, self.collision, -1, position, quaternion, physicsClientId=client)
         bullet.changeDynamics(body, -1, **self.dynamics, physicsClientId=client)
         return int(body)
 
 
-def _unit_inertia(shape: Shape) -> NDArray[np.float64]:
-    """(3,) diagonal inertia of a prism of mass 1 about its centre of mass [cell^2]; products are dropped."""
+def _unit_inertia(shape: Shape) -> Floats:
+    """Compute the diagonal inertia (3,) of a prism of mass 1 about its centre of mass [cell^2], without products."""
     a = np.asarray(shape.outline) - shape.center_of_mass[[0, 2]]
     b = np.roll(a, -1, axis=0)
     cross = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]

@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stackgen.data.generation.templates import draw_template, realize
+from stackgen.data.generation.designs import draw_design, realize
 from stackgen.sim.checkers import AcceptLimits, SimulatorChecker, accept, fell
 from stackgen.sim.physics import Physics, engine_version
 from stackgen.sim.simulator import Rollout
 from stackgen.stack import Stack
+from stackgen.world import PAPER_WORLD
 
 LIMITS, PHYSICS = AcceptLimits(), Physics()
 
@@ -76,7 +77,7 @@ def test_the_early_end_gives_the_same_verdicts() -> None:
     rng = np.random.default_rng(1)
     stacks = []
     for _ in range(16):
-        stack = realize(draw_template(rng), rng)
+        stack = realize(draw_design(rng, PAPER_WORLD), rng, PAPER_WORLD)
         keep = np.sort(rng.permutation(len(stack))[: len(stack) - 2])
         stacks.append(Stack(stack.shapes[keep], stack.poses[keep]))
     whole, early = SimulatorChecker(), SimulatorChecker(until_fall=True)

@@ -112,7 +112,7 @@ def test_a_block_on_a_slope_holds_if_friction_exceeds_the_slope(friction: float,
         np.array([[0, 0, 0.25, 0, 0, 0], [*place, 0, angle, 0]]),
         Catalogue((roof, Shape.box("tile", 0.5, 0.25))),
     )
-    with Simulator(Physics(friction=friction), stack.catalogue) as simulator:
+    with Simulator(Physics(friction=friction)) as simulator:
         rollout = simulator.rollout(stack)
     assert (np.linalg.norm(rollout.end.poses[1, :3] - place) < 0.02) == holds
     assert (rollout.drop[1] < 0.02) == holds
@@ -235,7 +235,7 @@ def test_the_catalogue_s_other_shapes_are_simulated_too() -> None:
     corners = tuple((float(np.cos(a)), float(np.sin(a))) for a in np.arange(8) * np.pi / 4)
     plank, coin = Shape.box("plank", 3, 0.25), Shape("coin", corners)
     catalogue = Catalogue((plank, coin, *PAPER_CATALOGUE))
-    with Simulator(catalogue=catalogue) as simulator:
+    with Simulator() as simulator:
         stack = Stack(np.array([2, 0]), np.array([[0, 0, 0.5, 0, 0, 0], [0.1, 0, 1.125, 0, 0, 0]]), catalogue)
         assert moved(simulator.rollout(stack)) < 0.03
         turned = Stack(np.array([1]), np.array([[0, 0, np.cos(np.pi / 8), 0, np.pi / 8, 0]]), catalogue)

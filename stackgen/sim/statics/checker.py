@@ -1,13 +1,14 @@
-"""Can contact forces hold a stack at rest, how far may it be tilted, and if they cannot, which blocks go?
+"""Can contact forces hold a stack at rest, how far may it be tilted, and if they cannot, which blocks move?
 
-Rigid-block statics with Coulomb friction: no time passes and no simulator is asked. Where the blocks
-touch is found in `contacts`, the linear programs are in `statics`; here are the verdict, its margin and
-the reasons. docs/equilibrium.md says what is assumed, and how well it agrees with PyBullet.
+Rigid-block statics with Coulomb friction: no time passes and no simulator is asked. `contacts` finds
+where the blocks touch, `programs` holds the linear programs; here are the verdict, its margin and the
+reasons. docs/statics.md says what is assumed, and how well the answers agree with PyBullet.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,11 +34,11 @@ SAFETY = math.radians(0.5)
 
 
 @dataclass(frozen=True)
-class Equilibrium:
+class StaticsAnswer:
     """What statics says of a stack.
 
     Args:
-        stable: Forces exist that hold every block, and go on to exist up to the safety margin.
+        stable: Whether forces exist that hold every block, also at any tilt up to the safety margin.
         margin: Largest tilt of the ground that the stack survives, in the worst direction [rad]; 0 where
             nothing holds it even on level ground.
         push: Largest horizontal force at the centre of mass of any one block, in the worst direction, as
@@ -57,16 +58,19 @@ class Equilibrium:
     contacts: tuple[Contact, ...]
 
 
-class EquilibriumChecker:
+class StaticsChecker:
     """A StabilityChecker that needs no simulator.
 
     Args:
-        physics: Whose friction it takes; the project's own by default.
+        physics: Numbers of the physics, of which friction matters; the project's own by default.
         contact_tolerance: Faces up to this far apart touch [cell].
-        safety: Margin that a stack must have to be called stable [rad]; 0 takes all that could stand.
+        safety: Margin that a stack must have to be called stable [rad]; 0 accepts all that could stand.
+
+    Raises:
+        StackgenError: If the tolerance or the safety margin is out of range.
 
     >>> cube, far = [0, 0, 0.5, 0, 0, 0], [0.6, 0, 1.5, 0, 0, 0]
-    >>> EquilibriumChecker().check(Stack([0, 0], [cube, far])).fell.tolist()
+    >>> StaticsChecker().check(Stack([0, 0], [cube, far])).fell.tolist()
     [False, True]
     """
 
@@ -83,38 +87,42 @@ class EquilibriumChecker:
         self.safety = safety
 
     def check(self, stack: Stack) -> Verdict:
-        """Judge one stack. Statics moves nothing: the settled stack is the stack, and no block sinks."""
-        found = self.equilibrium(stack)
+        """Give the verdict on one stack. Statics moves nothing: the settled stack is the stack, and no block sinks."""
+        found = self.answer(stack)
         return Verdict(found.stable, found.unheld, np.zeros(len(stack)), stack, found.stable, found.margin)
 
-    def equilibrium(self, stack: Stack, with_push: bool = False) -> Equilibrium:
-        """All that statics says of a stack.
+    def check_all(self, stacks: Iterable[Stack]) -> list[Verdict]:
+        """Give the verdicts on many stacks, in order."""
+        return [self.check(stack) for stack in stacks]
+
+    def answer(self, stack: Stack, with_push: bool = False) -> StaticsAnswer:
+        """Find all that statics says of a stack.
 
         Args:
-            stack: Blocks in any poses.
+            stack: The stack, its blocks in any poses.
             with_push: Whether to find the push, too: it takes several times as long as the rest.
         """
         if not len(stack):
-            return Equilibrium(True, math.pi / 2, None, np.zeros(0, dtype=bool), 0.0, ())
+            return StaticsAnswer(True, math.pi / 2, None, np.zeros(0, dtype=bool), 0.0, ())
         contacts = tuple(find_contacts(stack, self.contact_tolerance))
         statics = Statics(stack, contacts, self.physics.friction)
         everything = np.arange(len(stack))
         tilt = statics.limit(everything)
         if tilt is None:
             residual, falling = statics.missing()
-            return Equilibrium(False, 0.0, 0.0 if with_push else None, falling, residual, contacts)
+            return StaticsAnswer(False, 0.0, 0.0 if with_push else None, falling, residual, contacts)
         margin = math.atan(tilt[0])
         stable = margin >= self.safety
         pushes = [statics.limit(everything[i : i + 1]) for i in everything] if with_push else []
         push = min((limit[0] for limit in pushes if limit), default=0.0) if with_push else None
         unheld = np.zeros(len(stack), dtype=bool) if stable else statics.moving(tilt[1])
-        return Equilibrium(stable, margin, push, unheld, 0.0, contacts)
+        return StaticsAnswer(stable, margin, push, unheld, 0.0, contacts)
 
-    def reasons(self, stack: Stack, found: Equilibrium) -> dict[int, str]:
-        """Why each block that is not held is not, in words, by its number.
+    def reasons(self, stack: Stack, found: StaticsAnswer) -> dict[int, str]:
+        """Say why each block that is not held is not, by its number.
 
-        >>> checker, stack = EquilibriumChecker(), Stack([0, 0], [[0, 0, 0.5, 0, 0, 0], [0.75, 0, 1.5, 0, 0, 0]])
-        >>> checker.reasons(stack, checker.equilibrium(stack))
+        >>> checker, stack = StaticsChecker(), Stack([0, 0], [[0, 0, 0.5, 0, 0, 0], [0.75, 0, 1.5, 0, 0, 0]])
+        >>> checker.reasons(stack, checker.answer(stack))
         {1: 'centre of mass 0.25 cells beside its support'}
         """
         if found.stable:
@@ -128,10 +136,10 @@ class EquilibriumChecker:
 
 
 _GLUE = 10.0
-"""Friction at which nothing slides: what it holds would only slide."""
+"""Friction at which nothing slides: blocks that it holds would only slide."""
 
 
-def _reason(block: int, center: Floats, found: Equilibrium, slides: bool) -> str:
+def _reason(block: int, center: Floats, found: StaticsAnswer, slides: bool) -> str:
     supports = [contact for contact in found.contacts if contact.supports(block)]
     if not supports:
         return "hangs in the air"

@@ -29,11 +29,11 @@ Ints = NDArray[np.int64]
 Point = tuple[float, float]
 
 GROUND = -1
-"""Stands for the ground where a block's number is asked for."""
+"""The number of the ground, where a block's number is expected."""
 
 FLAT = 0.2
-"""Sine of the angle up to which an edge counts as lying in a plane: it may leave the tolerance on its
-way, and the patch then ends where it does. Steeper edges touch with their end only."""
+"""Sine of the angle up to which an edge counts as lying in a plane: where it leaves the tolerance the patch
+ends. Steeper edges touch with their end only."""
 
 SIDE = 0.02
 """Upright faces touch only up to this far apart [cell]: weight closes gaps below a block, not beside it."""
@@ -74,12 +74,12 @@ class Contact:
         return abs(self.normal[2]) < FLAT
 
     def supports(self, block: int) -> bool:
-        """Whether it pushes this block upwards."""
+        """Tell whether it pushes this block upwards."""
         upwards = self.normal[2] if block == self.block else -self.normal[2]
         return block in (self.block, self.by) and bool(upwards > FLAT)
 
     def other(self, block: int) -> int:
-        """Who is on the other side."""
+        """Return the number on the other side."""
         return self.by if block == self.block else self.block
 
 
@@ -105,7 +105,7 @@ class _Molds:
 
 
 def find_contacts(stack: Stack, tolerance: float) -> list[Contact]:
-    """All patches of a stack.
+    """Find all patches of a stack.
 
     Args:
         stack: The blocks.
@@ -120,7 +120,7 @@ class PlaneContacts:
     """Contacts of blocks that all stand in the plane of a design, seen from the front: c segments.
 
     Args:
-        block, by: (c,) who is pushed, and who owns the face, or GROUND.
+        block, by: (c,) number of the block that is pushed, and of the one that owns the face or GROUND.
         normal: (c, 2) unit vector out of the face, x and z.
         ends: (c, 2, 2) both ends of the segment, x and z [cell]; the second lies further along (normal z, -normal x).
         upright: (c,) whether the faces are nearly vertical.
@@ -133,17 +133,17 @@ class PlaneContacts:
     upright: NDArray[np.bool_]
 
     def on_top(self) -> PlaneContacts:
-        """Without those between upright faces."""
+        """Leave out the contacts between upright faces."""
         flat = ~self.upright
         return PlaneContacts(self.block[flat], self.by[flat], self.normal[flat], self.ends[flat], self.upright[flat])
 
 
 def find_plane_contacts(stack: Stack, tolerances: Sequence[float]) -> list[PlaneContacts]:
-    """All contacts of blocks that are near the plane y = 0 and turned about the y axis alone, for each tolerance.
+    """Find all contacts of blocks near the plane y = 0 that are turned about the y axis alone, for each tolerance.
 
     Args:
         stack: The blocks; depths and small departures from the plane do not matter.
-        tolerances: Faces up to this far apart touch, upright ones, too [cell].
+        tolerances: Largest gaps between faces that touch, upright ones, too [cell].
     """
     bodies = _place(stack)
     owner, face, other = _touching_faces(bodies, max(tolerances), max(tolerances))
@@ -180,7 +180,7 @@ def find_plane_contacts(stack: Stack, tolerances: Sequence[float]) -> list[Plane
 
 
 def _extent(coordinates: Floats, of: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Least and largest coordinate (P,) of some of the points (P, V); inf and -inf of none."""
+    """Return the least and largest coordinate (P,) of some of the points (P, V); inf and -inf of none."""
     low = np.where(of, coordinates, np.inf).min(axis=1, initial=np.inf)
     return low, np.where(of, coordinates, -np.inf).max(axis=1, initial=-np.inf)
 
@@ -222,8 +222,12 @@ def _between(bodies: _Bodies, tolerance: float) -> list[Contact]:
 
 
 def _touching_faces(bodies: _Bodies, tolerance: float, side: float) -> tuple[Ints, Ints, Ints]:
-    """For each pair of blocks that no face separates by more than the tolerance: the block that owns the
-    face which separates them best, the number of that face, and the other block; (P,) each."""
+    """Find the pairs of blocks that no face separates by more than the tolerance.
+
+    Returns:
+        For each pair the block that owns the face which separates them best, the number of that face, and the
+        other block; (P,) each.
+    """
     low, high = bodies.vertices.min(axis=1), bodies.vertices.max(axis=1)
     near = (low[:, None] <= high + tolerance).all(axis=2)
     one, two = np.nonzero(np.triu(near & near.T, 1))
@@ -243,7 +247,7 @@ def _touching_faces(bodies: _Bodies, tolerance: float, side: float) -> tuple[Int
 
 
 def _slice(vertices: Floats, edges: Ints, heights: Floats, tolerance: float) -> tuple[Floats, NDArray[np.bool_]]:
-    """Points (P, V + E, 3) that span what is up to `tolerance` high of each body, and which of them do so."""
+    """Return points (P, V + E, 3) that span what is up to `tolerance` high of each body, and which of them do so."""
     pair = np.arange(len(vertices))[:, None]
     start, end = vertices[pair, edges[..., 0]], vertices[pair, edges[..., 1]]
     low, high = heights[pair, edges[..., 0]], heights[pair, edges[..., 1]]
@@ -274,7 +278,7 @@ def _cast(catalogue: Catalogue) -> _Molds:
 
 
 def _features(shape: Shape) -> tuple[Floats, Floats, Ints, Ints]:
-    """Vertices (V, 3), face normals (F, 3), face corners (F, C) and edges (E, 2) of a prism."""
+    """Return vertices (V, 3), face normals (F, 3), face corners (F, C) and edges (E, 2) of a prism."""
     faces = prism_faces(shape)
     most = max(4, len(shape.outline))
     corners = np.array([face + face[:1] * (most - len(face)) for face in faces])
@@ -298,7 +302,9 @@ def _pairs(points: Floats) -> list[Point]:
 
 
 def hull(points: list[Point]) -> list[Point]:
-    """Corners of the convex hull, counter-clockwise; of points on a line its two ends.
+    """Return the corners of the convex hull, counter-clockwise; of points on a line its two ends.
+
+    OpenCV's hull works in 32 bits, and takes longer for so few points.
 
     >>> hull([(0, 0), (1, 0), (0.5, 0.1), (1, 1), (0, 1), (1, 0)])
     [(0, 0), (1, 0), (1, 1), (0, 1)]
@@ -321,7 +327,7 @@ def hull(points: list[Point]) -> list[Point]:
 
 
 def clip(polygon: list[Point], window: list[Point]) -> list[Point]:
-    """Corners of a convex polygon's part in a convex window; both are counter-clockwise.
+    """Return the corners of a convex polygon's part in a convex window; both are counter-clockwise.
 
     The polygon may be a point or a line. Corners of the window may repeat.
 
@@ -349,7 +355,7 @@ def clip(polygon: list[Point], window: list[Point]) -> list[Point]:
 
 
 def distance(point: Point, polygon: list[Point]) -> float:
-    """How far a point lies outside a convex counter-clockwise polygon, which may be a point or a line; 0 inside.
+    """Return how far a point lies outside a convex counter-clockwise polygon, which may be a point or a line.
 
     >>> distance((2, 0.5), [(0, 0), (1, 0), (1, 1), (0, 1)])
     1.0
@@ -365,7 +371,7 @@ def distance(point: Point, polygon: list[Point]) -> float:
 
 
 def _distinct(polygon: list[Point]) -> list[Point]:
-    """The corners without those that repeat an earlier one."""
+    """Leave out corners that repeat an earlier one."""
     kept: list[Point] = []
     for x, y in polygon:
         if all(abs(x - a) + abs(y - b) > _SAME for a, b in kept):

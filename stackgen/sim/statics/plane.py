@@ -1,9 +1,9 @@
-"""Does a part of a stack stand? Told by statics where that is beyond doubt, for a fraction of a simulation.
+"""Does a part of a stack stand? Statics answers where that is beyond doubt, at a fraction of a simulation's cost.
 
 The generator takes blocks out of stacks at rest. What is left keeps its poses, so where its blocks touch
 is known once for the whole stack, and each part of it is the same small problem with rows and columns
 left out: are there forces that only push, act inside the contacts and stay in the friction cones, and
-that cancel every weight? Three answers:
+that cancel every weight? There are three answers:
 
 - **stands**: yes, even with contacts narrowed at both ends, half of the friction, and a pull to either
   side. A margin on each makes up for what statics cannot know (how a load divides between supports) and
@@ -12,8 +12,8 @@ that cancel every weight? Three answers:
 - **unsure**: ask the simulator.
 
 The problem is plane: designs are prisms side by side in the (x, z) plane, all symmetric about it, and
-have three equations a block. A stack that has left the plane is for the simulator, too. A solution is
-looked for by non-negative least squares (Lawson and Hanson 1974), whose residual is 0 if there is one.
+have three equations a block. A stack that has left the plane is for the simulator, too. Non-negative
+least squares looks for a solution (Lawson and Hanson 1974); its residual is 0 if there is one.
 
 Legend: k blocks of the whole stack, c contacts, n forces. Lengths in cells, forces in weights of a cube.
 """
@@ -45,24 +45,29 @@ _MISSING = 1e-3
 
 
 @dataclass(frozen=True)
-class Certificate:
-    """When statics may speak for the simulator. docs/equilibrium.md has how often it would be wrong.
+class StaticsMargins:
+    """Margins by which statics is certain enough to answer for the simulator.
+
+    Settings and manifests call them `certificate`. docs/statics.md says how often they would be wrong.
 
     Args:
-        enabled: False asks the simulator about every stack.
-        sure_designs: Build only designs that certainly stand: one at its limit leaves parts at their limits.
-        inset: A stack stands only if forces this far inside both ends of each contact hold it [cell].
-        pull: ... and go on to hold it when every block is pulled to either side by this share of its weight.
-        friction_kept: ... with this share of the friction.
-        touch: ... where faces up to this far apart touch [cell].
-        confirm: A stack of which statics was unsure, but which stood when simulated, is taken only if forces
-            hold it without inset and pull (others lean on a neighbour, or are held by a friction that need
-            not last), and need not stand a second time if they do with this share of both.
-        outset: A stack falls only if forces this far outside both ends of each contact cannot hold it [cell].
-        friction_spared: ... with this multiple of the friction.
-        reach: ... where faces up to this far apart touch, below a block and beside it [cell].
-        out_of_plane: Statics keeps silent on stacks with a block further than this from the plane of the
-            design, or turned or leaning out of it by more [cell, rad].
+        enabled: Whether statics is asked at all; false simulates every stack.
+        sure_designs: Whether only designs that certainly stand are built: one at its limit leaves parts at theirs.
+        inset: Part of both ends of each contact that bears nothing in a stack that certainly stands [cell].
+        pull: Pull to either side on every block that a stack that certainly stands survives [share of its weight].
+        friction_kept: Share of the friction with which a stack that certainly stands must hold.
+        touch: Largest gap between faces that touch in a stack that certainly stands [cell].
+        confirm: Share of inset and pull. A stack of which statics was unsure, but which stood when simulated, is
+            taken only if forces hold it without inset and pull (others lean on a neighbour, or are held by a
+            friction that need not last), and need not stand a second time if they do with this share of both.
+        outset: Length added to both ends of each contact, with which a stack that certainly falls still falls [cell].
+        friction_spared: Multiple of the friction with which a stack that certainly falls still falls.
+        reach: Largest gap between faces that touch in a stack that certainly falls, below a block or beside it [cell].
+        out_of_plane: Largest distance, turn and lean of a block out of the plane of the design for statics to
+            answer at all [cell, rad].
+
+    Raises:
+        StackgenError: If a number is out of range.
     """
 
     enabled: bool = True
@@ -89,52 +94,52 @@ class Certificate:
 
 
 class PlaneStatics:
-    """What statics says of each part of one stack at rest.
+    """Tells of each part of one stack at rest whether it stands.
 
     >>> tower = Stack([0, 0, 0], [[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0], [0.48, 0, 2.5, 0, 0, 0]])
-    >>> statics = PlaneStatics(tower, friction=0.5, certificate=Certificate())
+    >>> statics = PlaneStatics(tower, friction=0.5, margins=StaticsMargins())
     >>> [statics.outcome(np.array(part)) for part in ([0, 1], [0, 2], [0, 1, 2])]
     ['stands', 'falls', 'unsure']
     """
 
-    def __init__(self, stack: Stack, friction: float, certificate: Certificate) -> None:
-        self.certificate = certificate
+    def __init__(self, stack: Stack, friction: float, margins: StaticsMargins) -> None:
+        self.margins = margins
         self.friction = friction
         self.weights = np.array([stack.catalogue[s].volume for s in stack.shapes])
-        self.plane = _plane(stack, certificate.out_of_plane)
+        self.plane = _plane(stack, margins.out_of_plane)
         self.centers = centers_of_mass(stack)[:, [0, 2]]
-        near, wide = find_plane_contacts(stack, (certificate.touch, certificate.reach))
+        near, wide = find_plane_contacts(stack, (margins.touch, margins.reach))
         # A neighbour that is merely near would have to be leant on first: it holds nothing for certain.
         self.near = near.on_top()
         self.certain = self._with_margins(1.0)
-        self.possible = _Forces.of(wide, self.centers, certificate.outset, friction * certificate.friction_spared)
+        self.possible = _Forces.of(wide, self.centers, margins.outset, friction * margins.friction_spared)
         self.lifted = self.possible.lifted(len(stack))
 
     def outcome(self, part: Ints) -> Outcome:
-        """Whether the part of the stack stands that consists of these blocks."""
+        """Tell whether the part of the stack that consists of these blocks stands."""
         if not self.plane[part].all():
             return "unsure"
         kept = np.zeros(len(self.weights) + 1, dtype=bool)  # GROUND is the last
         kept[part] = kept[GROUND] = True
         if not self.lifted[part][:, kept].any(axis=1).all():
             return "falls"  # something hangs in the air
-        if self._holds(self.certain, kept, part, self.certificate.pull):
+        if self._holds(self.certain, kept, part, self.margins.pull):
             return "stands"
         return "falls" if self.possible.missing(kept, part, self.weights, 0.0) > _MISSING else "unsure"
 
     @property
     def silent(self) -> bool:
-        """Whether the stack is none that statics can judge."""
+        """Whether the stack has left the plane, so that statics cannot answer."""
         return not self.plane.all()
 
     def holds(self, share: float) -> bool:
-        """Whether forces hold the whole stack with this share of inset and pull: 0 asks for neither, 1 for all."""
+        """Tell whether forces hold the whole stack with this share of inset and pull."""
         part, kept = np.arange(len(self.weights)), np.ones(len(self.weights) + 1, dtype=bool)
-        return self._holds(self._with_margins(share), kept, part, share * self.certificate.pull)
+        return self._holds(self._with_margins(share), kept, part, share * self.margins.pull)
 
     def _with_margins(self, share: float) -> _Forces:
-        margins = self.certificate
-        return _Forces.of(self.near, self.centers, -share * margins.inset, self.friction * margins.friction_kept)
+        inset = share * self.margins.inset
+        return _Forces.of(self.near, self.centers, -inset, self.friction * self.margins.friction_kept)
 
     def _holds(self, forces: _Forces, kept: Flags, part: Ints, pull: float) -> bool:
         return all(forces.missing(kept, part, self.weights, side) < _BALANCED for side in {pull, -pull})
@@ -145,7 +150,7 @@ class _Forces:
     """Forces that may arise at the ends of contacts, each along one side of its friction cone.
 
     Args:
-        block, by: (n,) who is pushed, and by whom.
+        block, by: (n,) number of the block that is pushed, and of the one that pushes or GROUND.
         effects: (3 k, n) force in x and z and torque on each block, by a unit of each force.
     """
 
@@ -155,21 +160,20 @@ class _Forces:
 
     @staticmethod
     def of(contacts: PlaneContacts, centers: Floats, outset: float, friction: float) -> _Forces:
-        """Those of contacts that are wider by `outset` at both ends.
+        """Collect the forces of contacts that are wider by `outset` at both ends.
 
         Args:
-            contacts: Of the stack.
+            contacts: Contacts of the stack.
             centers: (k, 2) centres of mass in the plane [cell].
-            outset: Negative makes them narrower; those with nothing left are dropped [cell].
-            friction: Coefficient.
+            outset: Length added at both ends [cell]; contacts that become narrower until nothing is left are dropped.
+            friction: Coefficient of friction.
         """
         k = len(centers)
         along = np.stack([contacts.normal[:, 1], -contacts.normal[:, 0]], axis=1)
         ends = contacts.ends + outset * along[:, None] * _BOTH
         there = np.flatnonzero(((ends[:, 1] - ends[:, 0]) * along).sum(axis=1) >= 0)
-        slip = (
-            np.where(contacts.upright, 0.0, friction)[:, None, None] * along[:, None] * _BOTH
-        )  # nothing squeezed those
+        grip = np.where(contacts.upright, 0.0, friction)  # nothing squeezed upright faces
+        slip = grip[:, None, None] * along[:, None] * _BOTH
         force = np.broadcast_to((contacts.normal[:, None] + slip)[:, None], (len(along), 2, 2, 2))[there]
         block, by, ends = contacts.block[there], contacts.by[there], ends[there]
         effects = np.zeros((len(there), 2, 2, k + 1, 3))  # contact, end, side of the cone, block or GROUND
@@ -181,7 +185,7 @@ class _Forces:
         return _Forces(np.repeat(block, 4), np.repeat(by, 4), columns)
 
     def lifted(self, k: int) -> Flags:
-        """(k, k + 1) whether some force pushes a block upwards that comes from another, or from GROUND, the last."""
+        """Tell which blocks (k, k + 1) some force of another block, or of GROUND, the last, pushes upwards."""
         lifts = np.zeros((k + 1, k + 1), dtype=bool)
         upwards = self.effects[3 * self.block + 1, np.arange(len(self.block))]
         lifts[self.block[upwards > 0], self.by[upwards > 0]] = True
@@ -189,13 +193,16 @@ class _Forces:
         return lifts[:k]
 
     def missing(self, kept: Flags, part: Ints, weights: Floats, pull: float) -> float:
-        """Norm of the forces and torques that the blocks of a part lack to be at rest; nan if it was not found.
+        """Return the norm of the forces and torques that the blocks of a part lack to be at rest.
 
         Args:
             kept: (k + 1,) which blocks are in the part, and GROUND.
-            part: The same as numbers.
-            weights: (k,) of all blocks [weight of a cube].
-            pull: To one side, of each block, as a share of its weight.
+            part: Numbers of the blocks in the part.
+            weights: (k,) weights of all blocks [weight of a cube].
+            pull: Pull to one side on each block, as a share of its weight.
+
+        Returns:
+            The norm; nan if it was not found.
         """
         needed = np.zeros((len(part), 3))
         needed[:, 0], needed[:, 1] = -pull * weights[part], weights[part]
@@ -214,6 +221,6 @@ _BOTH = np.array([[-1.0], [1.0]])
 
 
 def _plane(stack: Stack, limit: float) -> Flags:
-    """(k,) which blocks are in the plane of the design and neither turned nor leaning out of it."""
+    """Tell which blocks (k,) are in the plane of the design and neither turned nor leaning out of it."""
     aside = rotation_matrices(stack.poses[:, 3:])[..., [0, 2], 1]  # of each block's y axis
     return np.asarray((np.abs(stack.poses[:, 1]) <= limit) & (np.abs(aside).max(axis=1, initial=0) <= limit))

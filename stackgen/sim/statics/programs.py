@@ -33,11 +33,11 @@ Flags = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 CONE_SIDES = 4
-"""Of the pyramid around the friction cone, along and across an edge of the face. It touches the cone from
-outside: a block slides at the angle of friction down its worst slope, later down one at the diagonal."""
+"""Sides of the pyramid around the friction cone, along and across an edge of the face. It touches the cone
+from outside: a block slides at the angle of friction down its worst slope, later down one at the diagonal."""
 
 _EPSILON = 1e-6
-"""Less than this is rounding."""
+"""Numbers below this are rounding."""
 
 
 class Statics:
@@ -62,7 +62,7 @@ class Statics:
         self.bears = np.repeat(_tree(contacts, self.k), 6)[kept]
 
     def limit(self, pulled: Ints) -> tuple[float, Floats] | None:
-        """How hard some blocks may be pulled together in the worst horizontal direction.
+        """Find how hard some blocks may be pulled together in the worst horizontal direction.
 
         The equations are solved beforehand: a tree of patches that joins every block to the ground
         carries what the other patches and the pull leave over. What remains is a program in few unknowns
@@ -100,12 +100,12 @@ class Statics:
         return None if limit < -_EPSILON else (max(limit, 0.0), given_way)  # rounding must not fell a knife-edge
 
     def moving(self, given_way: Floats) -> Flags:
-        """(k,) which blocks take part in the motion in which a pull at its limit parts the patches."""
+        """Tell which blocks (k,) take part in the motion in which a pull at its limit parts the patches."""
         parting = given_way @ self.allowed
         return _moves(np.linalg.solve(self.transmit[:, self.bears].T, parting[self.bears]))
 
     def missing(self) -> tuple[float, Flags]:
-        """The least sum of missing forces and torques, and (k,) which blocks move for want of them.
+        """Find the least sum of missing forces and torques, and which blocks (k,) move for want of them.
 
         The dual solution is a motion of the blocks, bounded in each coordinate, along which no contact
         resists and the weights do the most work: the blocks that it moves are those that cannot be held.
@@ -127,12 +127,12 @@ class _NothingHoldsIt(Exception):
 
 
 def _moves(motion: Floats) -> Flags:
-    """(k,) which blocks a motion (6 k,) moves."""
+    """Tell which blocks (k,) a motion (6 k,) moves."""
     return np.abs(motion).reshape(-1, 6).max(axis=1) > _EPSILON
 
 
 def _tree(contacts: tuple[Contact, ...], k: int) -> list[bool]:
-    """Which contacts with friction join the blocks to the ground: one for each block that is joined at all."""
+    """Choose contacts with friction that join the blocks to the ground: one for each block that is joined at all."""
     joined: set[int] = {GROUND}
     tree = [False] * len(contacts)
     rough = [(number, contact) for number, contact in enumerate(contacts) if not contact.upright]
@@ -159,7 +159,7 @@ class _Patches:
 
     @staticmethod
     def of(contacts: tuple[Contact, ...]) -> _Patches:
-        """From contacts."""
+        """Collect contacts."""
         normal = np.array([contact.normal for contact in contacts]).reshape(-1, 3)
         tangent = np.array([contact.tangent for contact in contacts]).reshape(-1, 3)
         axes = np.stack([normal, tangent, np.cross(normal, tangent)], axis=1)
@@ -173,7 +173,7 @@ class _Patches:
 
 
 def _effects(patches: _Patches, centers: Floats) -> Floats:
-    """(6 k, 6 c): the force on each block, and the torque about its centre of mass, by each patch's unknowns."""
+    """Return the force on each block and the torque about its centre of mass by each unknown, (6 k, 6 c)."""
     k, c = len(centers), len(patches.block)
     effects = np.zeros((c, k, 2, 3, 2, 3))
     for sign, block in ((1.0, patches.block), (-1.0, patches.by)):
@@ -187,9 +187,9 @@ def _effects(patches: _Patches, centers: Floats) -> Floats:
 
 
 def _in_patch(patches: _Patches) -> Floats:
-    """(r, 6 c) rows that are not negative where each normal force pushes, and acts inside its patch.
+    """Return rows (r, 6 c) that are not negative where each normal force pushes, and acts inside its patch.
 
-    The same as forces at the corners that push.
+    That is the same as forces at the corners that push.
     """
     sides = [(i, *side) for i, corners in enumerate(patches.corners) for side in _half_planes(corners)]
     c = len(patches.corners)
@@ -205,10 +205,10 @@ def _in_patch(patches: _Patches) -> Floats:
 
 
 def _in_cone(patches: _Patches, friction: float, rough: Flags) -> Floats:
-    """(r, 6 c) rows that are not negative where friction holds, for the patches that have any.
+    """Return rows (r, 6 c) that are not negative where friction holds, for the patches that have any.
 
-    It is at most its share of the normal force in each of `CONE_SIDES` directions; its torque about the
-    normal is at most what it does at the furthest corner.
+    Friction is at most its share of the normal force in each of `CONE_SIDES` directions; its torque about
+    the normal is at most that of all of it at the furthest corner.
     """
     c, which = len(rough), np.flatnonzero(rough)
     rows = np.zeros((len(which), CONE_SIDES + 2, c, 6))
@@ -223,7 +223,7 @@ def _in_cone(patches: _Patches, friction: float, rough: Flags) -> Floats:
 
 
 _SMOOTH = np.array([True, False, False, False, True, True])
-"""What patches at upright faces have of the six unknowns: no friction.
+"""Which of the six unknowns patches at upright faces have: those without friction.
 
 Two neighbours could hold a block between them by squeezing it, and statics would find that force; but
 nothing ever squeezed them, so the block falls.
@@ -231,7 +231,7 @@ nothing ever squeezed them, so the block falls.
 
 
 def _half_planes(corners: list[Point]) -> list[tuple[float, float, float]]:
-    """(u, v, offset) with u x + v y >= offset in a convex counter-clockwise polygon, or on a line or a point."""
+    """Return (u, v, offset) with u x + v y >= offset in a convex counter-clockwise polygon, line or point."""
     if len(corners) == 1:
         (x, y) = corners[0]
         return [(1, 0, x), (-1, 0, -x), (0, 1, y), (0, -1, -y)]
@@ -246,7 +246,7 @@ def _half_planes(corners: list[Point]) -> list[tuple[float, float, float]]:
 
 
 def _solver(matrix: Floats, cost: Floats, rhs: Floats, free: int = 0, inequalities: int = 0) -> highspy.Highs:
-    """HiGHS with the program: least `cost @ x` where `matrix @ x = rhs` and x >= 0.
+    """Set HiGHS up for the least `cost @ x` where `matrix @ x = rhs` and x >= 0.
 
     The first `free` unknowns have any sign; the last `inequalities` rows are at least their right-hand side.
     """
@@ -268,8 +268,8 @@ def _solver(matrix: Floats, cost: Floats, rhs: Floats, free: int = 0, inequaliti
     return solver
 
 
-# Small, well scaled programs, of which only the right-hand side changes from one to the next: what helps
-# with large ones would only cost time.
+# The programs are small and well scaled, and only the right-hand side changes from one to the next: what
+# helps with large ones would only cost time.
 _OPTIONS: dict[str, bool | int | float | str] = {
     "output_flag": False,
     "threads": 1,
@@ -281,10 +281,10 @@ _OPTIONS: dict[str, bool | int | float | str] = {
 
 
 def _solve(solver: highspy.Highs, certain: bool = False) -> bool:
-    """Whether there is a solution; where one is `certain`, another answer is not believed at once."""
+    """Solve, and tell whether there is a solution; where one is `certain`, another answer is not believed at once."""
     solver.run()
     if solver.getModelStatus() not in (_ANSWERS[:1] if certain else _ANSWERS):
-        solver.clearSolver()  # rounding got in the way: afresh, with all that HiGHS has against that
+        solver.clearSolver()  # rounding got in the way: start afresh, with all that HiGHS has against it
         for option, choice in _CAREFUL.items():
             solver.setOptionValue(option, choice)
         solver.run()
@@ -301,11 +301,11 @@ _CAREFUL: dict[str, bool | int | float | str] = {
 
 
 def inradius(furthest: Callable[[Floats], tuple[Floats, Floats]], tolerance: float = 5e-4) -> tuple[float, Floats]:
-    """Distance from the origin to the border of a convex set in the plane around it.
+    """Find the distance from the origin to the border of a convex set in the plane around it.
 
     Args:
-        furthest: The point (2,) of the set that is furthest in a direction (2,), and a note on it.
-        tolerance: By how much the distance may be too large.
+        furthest: Function from a direction (2,) to the furthest point (2,) of the set, and a note on it.
+        tolerance: Largest error of the distance, which is never too small.
 
     Returns:
         The distance, and the note on the nearest side.
@@ -327,7 +327,7 @@ def inradius(furthest: Callable[[Floats], tuple[Floats, Floats]], tolerance: flo
 
 
 def _sides(polygon: list[Floats]) -> list[tuple[float, float]]:
-    """Distance from the origin and angle of the outward normal of each side of a counter-clockwise polygon."""
+    """Return the distance from the origin and the angle of the outward normal of each side of a polygon."""
     sides = []
     for (ax, ay), (bx, by) in zip(polygon, polygon[1:] + polygon[:1], strict=True):
         length = math.hypot(bx - ax, by - ay)

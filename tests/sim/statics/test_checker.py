@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,12 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from stackgen.data.shards import Manifest
+from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.errors import StackgenError
 from stackgen.geometry import centers_of_mass, mirror
 from stackgen.io.stacks_file import read_stacks
 from stackgen.sim.physics import Physics
-from stackgen.sim.statics.checker import EquilibriumChecker
+from stackgen.sim.statics.checker import StaticsChecker
 from stackgen.sim.statics.contacts import GROUND, Contact, find_contacts
 from stackgen.sim.statics.programs import inradius
 from stackgen.stack import Stack
@@ -27,8 +28,7 @@ from stackgen.world import Catalogue, Shape
 from tests.conftest import Cli, stacks_json
 
 CUBE, RECTANGLE, LONG, TRIANGLE = range(4)
-TESTSET = Path(__file__).parents[3] / "stackgen" / "assets" / "testset-v1"
-FREE = EquilibriumChecker(safety=0)
+FREE = StaticsChecker(safety=0)
 """Takes all that could stand."""
 
 
@@ -49,14 +49,13 @@ def turned(upright: Stack, yaw: float, shift: tuple[float, float] = (0, 0)) -> S
 
 def slope(stack: Stack, friction: float = 0.5) -> float:
     """Tangent of the margin."""
-    return math.tan(EquilibriumChecker(Physics(friction=friction), safety=0).equilibrium(stack).margin)
+    return math.tan(StaticsChecker(Physics(friction=friction), safety=0).answer(stack).margin)
 
 
 def settled_stacks(number: int, start: int = 0) -> list[Stack]:
     """Some of the frozen test set."""
-    manifest = Manifest.load(TESTSET)
-    samples = list(manifest.samples(TESTSET, "test"))[start : start + number]
-    return [sample.stack(manifest.catalogue) for sample in samples]
+    testset = Dataset.open(TESTSET)
+    return [sample.stack(testset.world.catalogue) for sample in islice(testset.samples("test"), start, start + number)]
 
 
 def without(whole: Stack, block: int) -> Stack:
@@ -150,16 +149,16 @@ def test_an_overhang_tips_alone_or_takes_its_support_along(d: float) -> None:
 
 @pytest.mark.parametrize(("d", "stands"), [(0.49, True), (0.51, False), (-0.49, True), (-0.51, False)])
 def test_an_overhang_stands_until_its_centre_of_mass_is_outside(d: float, stands: bool) -> None:
-    found = FREE.equilibrium(stack((CUBE, 0, 0.5), (CUBE, d, 1.5), yaw=0.2))
+    found = FREE.answer(stack((CUBE, 0, 0.5), (CUBE, d, 1.5), yaw=0.2))
     assert found.stable is stands
     assert found.unheld.tolist() == [False, not stands]
 
 
 def test_the_safety_margin_separates_what_could_stand_from_what_is_called_stable() -> None:
     marginal = stack((CUBE, 0, 0.5), (CUBE, 0.495, 1.5))  # tips at atan(0.01)
-    assert FREE.equilibrium(marginal).stable
+    assert FREE.answer(marginal).stable
     for safety, stable in ((0.009, True), (0.011, False)):
-        found = EquilibriumChecker(safety=safety).equilibrium(marginal)
+        found = StaticsChecker(safety=safety).answer(marginal)
         assert found.stable is stable and found.margin == pytest.approx(0.01, abs=1e-3)
         assert found.unheld.tolist() == [False, not stable]
         assert found.residual == 0
@@ -167,16 +166,16 @@ def test_the_safety_margin_separates_what_could_stand_from_what_is_called_stable
 
 def test_a_block_on_the_tail_holds_an_overhang() -> None:
     overhang = ((CUBE, 0, 0.5), (RECTANGLE, 0.6, 1.5))
-    assert not FREE.equilibrium(stack(*overhang)).stable
-    assert FREE.equilibrium(stack(*overhang, (CUBE, 0.1, 2.5))).stable
-    assert not FREE.equilibrium(stack(*overhang, (CUBE, 0.4, 2.5))).stable  # (2 * 0.6 + 0.4) / 3 > 0.5
+    assert not FREE.answer(stack(*overhang)).stable
+    assert FREE.answer(stack(*overhang, (CUBE, 0.1, 2.5))).stable
+    assert not FREE.answer(stack(*overhang, (CUBE, 0.4, 2.5))).stable  # (2 * 0.6 + 0.4) / 3 > 0.5
 
 
 def test_a_bridge_needs_both_piers() -> None:
     bridge = stack((CUBE, -1.2, 0.5), (CUBE, 1.2, 0.5), (LONG, 0, 1.5))
-    assert FREE.equilibrium(bridge).stable
+    assert FREE.answer(bridge).stable
     for pier in (0, 1):
-        assert FREE.equilibrium(without(bridge, pier)).unheld.tolist() == [False, True]
+        assert FREE.answer(without(bridge, pier)).unheld.tolist() == [False, True]
 
 
 def test_a_triangle_stands_on_a_cube_and_nothing_on_a_triangle() -> None:
@@ -184,8 +183,8 @@ def test_a_triangle_stands_on_a_cube_and_nothing_on_a_triangle() -> None:
     height = (1 * 0.5 + 0.5 * (1 + 1 / 3)) / 1.5  # of the common centre of mass; alone it tips at 1.5
     assert slope(roof, 5) == pytest.approx(0.5 / height, abs=1e-3)
     edge = stack((TRIANGLE, 0, 0.5), (RECTANGLE, 0, 1.5))
-    assert FREE.equilibrium(edge).margin < 1e-3 and not EquilibriumChecker().equilibrium(edge).stable
-    assert FREE.equilibrium(stack((TRIANGLE, 0, 0.5), (RECTANGLE, 0.1, 1.5))).unheld[1]
+    assert FREE.answer(edge).margin < 1e-3 and not StaticsChecker().answer(edge).stable
+    assert FREE.answer(stack((TRIANGLE, 0, 0.5), (RECTANGLE, 0.1, 1.5))).unheld[1]
 
 
 @pytest.mark.parametrize("friction", [0.3, 0.7])
@@ -196,22 +195,22 @@ def test_a_block_on_a_ramp_slides_beyond_the_angle_of_friction(friction: float, 
     angle = math.atan(incline)
     pose = [-0.1 * math.sin(angle), 0, 2 * incline + 0.1 * math.cos(angle), 0, -angle, 0]
     on_ramp = Stack(np.array([0, 1]), np.array([[0, 0, 2 * incline, 0, 0, 0], pose]), Catalogue((ramp, tile)))
-    checker = EquilibriumChecker(Physics(friction=friction), safety=0)
-    found = checker.equilibrium(on_ramp)
+    checker = StaticsChecker(Physics(friction=friction), safety=0)
+    found = checker.answer(on_ramp)
     assert found.stable is (incline < friction)
     assert checker.reasons(on_ramp, found) == ({} if incline < friction else {1: "would slide"})
 
 
 def test_neighbours_do_not_hold_a_block_by_squeezing_it() -> None:
     towers = [(CUBE, x, z) for x in (-1, 1) for z in (0.5, 1.5, 2.5)]
-    found = FREE.equilibrium(stack(*towers, (CUBE, 0, 1.5)))
+    found = FREE.answer(stack(*towers, (CUBE, 0, 1.5)))
     assert found.unheld[6] and found.residual == pytest.approx(1)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.3])
 def test_corners_that_meet_bear_nothing(yaw: float) -> None:
     stairs = stack((CUBE, 0, 0.5), (CUBE, 1, 1.5), yaw=yaw)
-    assert FREE.equilibrium(stairs).unheld.tolist() == [False, True]
+    assert FREE.answer(stairs).unheld.tolist() == [False, True]
     assert not any(contact.supports(1) for contact in find_contacts(stairs, 0.08))
 
 
@@ -220,14 +219,14 @@ def test_corners_that_meet_bear_nothing(yaw: float) -> None:
 
 def test_a_push_slides_a_cube_or_tips_it() -> None:
     for friction, expected in ((0.5, 0.5), (2.0, 1.0)):
-        found = EquilibriumChecker(Physics(friction=friction)).equilibrium(stack((CUBE, 0, 0.5)), with_push=True)
+        found = StaticsChecker(Physics(friction=friction)).answer(stack((CUBE, 0, 0.5)), with_push=True)
         assert found.push == pytest.approx(expected, abs=1e-3)
 
 
 @pytest.mark.parametrize("height", [2, 4])
 def test_a_push_at_the_top_tips_a_rough_tower(height: int) -> None:
     tower = stack(*((CUBE, 0, i + 0.5) for i in range(height)))
-    found = EquilibriumChecker(Physics(friction=5)).equilibrium(tower, with_push=True)
+    found = StaticsChecker(Physics(friction=5)).answer(tower, with_push=True)
     # Pushing block j tips the whole tower, or all from some joint on: the worst is all of it, at the top,
     # unless the top block goes over alone.
     expected = min((height - i) * 0.5 / (height - 0.5 - i) for i in range(height))
@@ -239,7 +238,7 @@ def test_a_push_at_the_top_tips_a_rough_tower(height: int) -> None:
 
 def test_the_residual_of_a_floating_block_is_its_weight_and_its_load() -> None:
     floating = stack((CUBE, 0, 0.5), (RECTANGLE, 0, 2.5), (TRIANGLE, 0, 3.5))
-    found = FREE.equilibrium(floating)
+    found = FREE.answer(floating)
     assert found.unheld.tolist() == [False, True, True]
     assert found.residual == pytest.approx(2.5)
     assert FREE.reasons(floating, found) == {1: "hangs in the air", 2: "loses its support, block 1"}
@@ -247,20 +246,20 @@ def test_the_residual_of_a_floating_block_is_its_weight_and_its_load() -> None:
 
 def test_reasons_tell_a_tipped_block_from_one_beside_its_support() -> None:
     beside = stack((CUBE, 0, 0.5), (LONG, 0.8, 1.5))
-    assert FREE.reasons(beside, FREE.equilibrium(beside)) == {1: "centre of mass 0.30 cells beside its support"}
+    assert FREE.reasons(beside, FREE.answer(beside)) == {1: "centre of mass 0.30 cells beside its support"}
     loaded = stack((CUBE, 0, 0.5), (RECTANGLE, 0.4, 1.5), (CUBE, 1.2, 2.5))
-    reasons = FREE.reasons(loaded, FREE.equilibrium(loaded))
+    reasons = FREE.reasons(loaded, FREE.answer(loaded))
     assert reasons == {1: "is tipped over by what it carries", 2: "loses its support, block 1"}
     marginal = stack((CUBE, 0, 0.5), (CUBE, 0.49, 1.5))
-    careful = EquilibriumChecker(safety=0.1)
-    assert careful.reasons(marginal, careful.equilibrium(marginal)) == {1: "would go at a tilt of 1.1 degrees"}
+    careful = StaticsChecker(safety=0.1)
+    assert careful.reasons(marginal, careful.answer(marginal)) == {1: "would go at a tilt of 1.1 degrees"}
 
 
 def test_no_blocks_stand_and_wrong_settings_are_named() -> None:
     assert FREE.check(Stack(np.zeros(0, dtype=int), np.zeros((0, 6)))).stable
     for tolerance, safety in ((0, 0), (2, 0), (0.1, -1), (0.1, 2)):
         with pytest.raises(StackgenError, match="contact_tolerance must lie in"):
-            EquilibriumChecker(contact_tolerance=tolerance, safety=safety)
+            StaticsChecker(contact_tolerance=tolerance, safety=safety)
 
 
 def corner_forces_hold(whole: Stack, friction: float = 0.5) -> bool:
@@ -289,7 +288,7 @@ def test_forces_of_patches_exist_where_forces_at_their_corners_do() -> None:
         noisy = whole.with_poses(whole.poses + rng.normal(0, 0.02, whole.poses.shape))
         for one in (whole, noisy):
             held.append(corner_forces_hold(one))
-            assert FREE.equilibrium(one).stable == held[-1]
+            assert FREE.answer(one).stable == held[-1]
     assert 20 < sum(held) < 100
 
 
@@ -303,7 +302,7 @@ def shaken(number: int) -> list[Stack]:
 
 
 def same(a: Stack, b: Stack, order: NDArray[np.int64] | None = None) -> None:
-    one, two = FREE.equilibrium(a), FREE.equilibrium(b)
+    one, two = FREE.answer(a), FREE.answer(b)
     assert one.stable == two.stable
     assert one.margin == pytest.approx(two.margin, rel=0.02, abs=2e-3)
     assert one.residual == pytest.approx(two.residual, rel=0.5, abs=1e-3)  # torques are counted along the axes
@@ -315,7 +314,7 @@ def test_symmetries_do_not_change_the_verdict() -> None:
     rng = np.random.default_rng(0)
     verdicts = set()
     for whole in shaken(12):
-        verdicts.add(FREE.equilibrium(whole).stable)
+        verdicts.add(FREE.answer(whole).stable)
         same(whole, turned(whole, 0.7, (3, -2)))
         same(whole, mirror(whole), np.arange(len(whole)))
         order = rng.permutation(len(whole))
@@ -324,9 +323,9 @@ def test_symmetries_do_not_change_the_verdict() -> None:
 
 
 def test_scale_density_and_gravity_do_not_matter() -> None:
-    other = EquilibriumChecker(replace(Physics(), cell_size=1.0, density=1.0, gravity=1.6), safety=0)
+    other = StaticsChecker(replace(Physics(), cell_size=1.0, density=1.0, gravity=1.6), safety=0)
     for whole in shaken(6):
-        assert FREE.equilibrium(whole).margin == other.equilibrium(whole).margin
+        assert FREE.answer(whole).margin == other.answer(whole).margin
 
 
 def test_what_is_not_stable_has_a_block_that_is_not_held() -> None:
@@ -334,7 +333,7 @@ def test_what_is_not_stable_has_a_block_that_is_not_held() -> None:
     for whole in settled_stacks(10):
         noisy = whole.with_poses(whole.poses + rng.normal(0, 0.1, whole.poses.shape))
         for safety in (0, 0.05):
-            verdict = EquilibriumChecker(safety=safety).check(noisy)
+            verdict = StaticsChecker(safety=safety).check(noisy)
             assert verdict.stable != verdict.fell.any()
             assert verdict.margin is not None and verdict.stable <= (verdict.margin >= safety)
 
@@ -365,7 +364,7 @@ def test_statics_and_simulator_agree_on_settled_stacks_and_on_what_is_left_of_th
     rng = np.random.default_rng(5)
     wholes = settled_stacks(50, start=100)
     judged = wholes + [without(whole, int(rng.integers(len(whole)))) for whole in wholes]
-    simulator, statics = SimulatorChecker(until_fall=True), EquilibriumChecker()
+    simulator, statics = SimulatorChecker(until_fall=True), StaticsChecker()
     truth = np.array([simulator.check(s).stable for s in judged])
     said = np.array([statics.check(s).stable for s in judged])
     assert 10 < (~truth).sum() < 50  # both verdicts are common

@@ -8,14 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stackgen.data.generation.templates import draw_template, realize
+from stackgen.data.generation.designs import draw_design, realize
 from stackgen.errors import StackgenError
 from stackgen.geometry import mirror
 from stackgen.sim.checkers import AcceptLimits, accept
 from stackgen.sim.simulator import Simulator
 from stackgen.sim.statics.contacts import GROUND, find_contacts, find_plane_contacts
-from stackgen.sim.statics.plane import Certificate, PlaneStatics
+from stackgen.sim.statics.plane import PlaneStatics, StaticsMargins
 from stackgen.stack import Stack
+from stackgen.world import PAPER_WORLD
 
 FRICTION = 0.5
 CUBE, RECTANGLE, LONG, TRIANGLE = range(4)
@@ -29,7 +30,7 @@ def stack_of(*blocks: tuple[int, float, float]) -> Stack:
 def outcome(stack: Stack, *blocks: int, **margins: Any) -> str:
     """Of the blocks with these numbers, or of all."""
     part = np.array(blocks or range(len(stack)))
-    return PlaneStatics(stack, FRICTION, replace(Certificate(), **margins)).outcome(part)
+    return PlaneStatics(stack, FRICTION, replace(StaticsMargins(), **margins)).outcome(part)
 
 
 def overhang(by: float) -> Stack:
@@ -39,7 +40,7 @@ def overhang(by: float) -> Stack:
 
 def designs(number: int, seed: int = 0) -> list[Stack]:
     rng = np.random.default_rng(seed)
-    return [realize(draw_template(rng), rng) for _ in range(number)]
+    return [realize(draw_design(rng, PAPER_WORLD), rng, PAPER_WORLD) for _ in range(number)]
 
 
 # Cases that can be told by hand.
@@ -100,13 +101,13 @@ def test_what_left_the_plane_of_the_design_is_for_the_simulator() -> None:
         poses[1, column] = by
         moved = tower.with_poses(poses)
         assert outcome(moved) == "unsure" and outcome(moved, 0) == "stands"
-        assert PlaneStatics(moved, FRICTION, Certificate()).silent
+        assert PlaneStatics(moved, FRICTION, StaticsMargins()).silent
 
 
 def test_margins_that_make_no_sense_are_named() -> None:
     for wrong in ({"inset": -0.1}, {"touch": 0.2}, {"friction_kept": 1.5}, {"friction_spared": 0.9}, {"confirm": 2.0}):
         with pytest.raises(StackgenError, match=next(iter(wrong))):
-            Certificate(**wrong)  # type: ignore[arg-type]
+            StaticsMargins(**wrong)  # type: ignore[arg-type]
 
 
 # Laws.
@@ -116,10 +117,10 @@ def test_a_part_is_judged_as_if_it_were_the_whole() -> None:
     rng = np.random.default_rng(1)
     seen = set()
     for stack in designs(25):
-        whole = PlaneStatics(stack, FRICTION, Certificate())
+        whole = PlaneStatics(stack, FRICTION, StaticsMargins())
         for _ in range(6):
             part = np.sort(rng.permutation(len(stack))[: rng.integers(2, len(stack) + 1)])
-            alone = PlaneStatics(Stack(stack.shapes[part], stack.poses[part]), FRICTION, Certificate())
+            alone = PlaneStatics(Stack(stack.shapes[part], stack.poses[part]), FRICTION, StaticsMargins())
             assert whole.outcome(part) == alone.outcome(np.arange(len(part)))
             seen.add(whole.outcome(part))
     assert seen == {"stands", "falls", "unsure"}
@@ -165,7 +166,7 @@ def test_what_statics_is_certain_of_the_simulator_says_too() -> None:
             if not accept(settled, AcceptLimits()):
                 continue
             stack = settled.end
-            statics = PlaneStatics(stack, FRICTION, Certificate())
+            statics = PlaneStatics(stack, FRICTION, StaticsMargins())
             for _ in range(4):
                 part = np.sort(rng.permutation(len(stack))[rng.integers(1, 4) :])
                 word = statics.outcome(part)

@@ -19,13 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common import argument_parser, plain_table, report, start
-from stackgen.data.generation.generate import TESTSET
-from stackgen.data.shards import Manifest
+from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.errors import StackgenError
 from stackgen.io.stacks_file import read_stacks
 from stackgen.protocols import Verdict
 from stackgen.sim.checkers import SimulatorChecker
-from stackgen.sim.statics.checker import CONTACT_TOLERANCE, SAFETY, Equilibrium, EquilibriumChecker
+from stackgen.sim.statics.checker import CONTACT_TOLERANCE, SAFETY, StaticsAnswer, StaticsChecker
 from stackgen.stack import Stack
 
 KINDS = ("settled", "less a block", "shaken")
@@ -44,7 +43,7 @@ class Case:
     name: str
     stack: Stack
     simulated: Verdict
-    statics: Equilibrium
+    statics: StaticsAnswer
 
     def said(self, safety: float) -> bool:
         """Whether statics calls it stable with a safety margin [rad]."""
@@ -67,8 +66,8 @@ def main() -> None:
     if options.number < 1:
         raise StackgenError("--number must be at least 1")
     stacks = from_files(options.files) if options.files else drawn(options)
-    simulator, statics = SimulatorChecker(catalogue=stacks[0][2].catalogue), EquilibriumChecker(safety=0)
-    cases = [Case(*named, simulator.check(named[2]), statics.equilibrium(named[2])) for named in stacks]
+    simulator, statics = SimulatorChecker(), StaticsChecker(safety=0)
+    cases = [Case(*named, simulator.check(named[2]), statics.answer(named[2])) for named in stacks]
     figures: dict[str, Any] = {
         "physics": simulator.physics.to_json(),
         "contact_tolerance": CONTACT_TOLERANCE,
@@ -79,7 +78,7 @@ def main() -> None:
         "milliseconds": times([case.stack for case in cases]),
         "disagreements": disagreements(cases),
     }
-    report("equilibrium", figures, tables(figures), options.out)
+    report("statics", figures, tables(figures), options.out)
 
 
 def from_files(files: Sequence[Path]) -> list[tuple[str, str, Stack]]:
@@ -93,13 +92,13 @@ def from_files(files: Sequence[Path]) -> list[tuple[str, str, Stack]]:
 
 def drawn(options: argparse.Namespace) -> list[tuple[str, str, Stack]]:
     """Stacks of each kind, drawn anew for each."""
-    manifest = Manifest.load(TESTSET)
-    samples = list(manifest.samples(TESTSET, "test"))
+    testset = Dataset.open(TESTSET)
+    samples = list(testset.samples("test"))
     rng = np.random.default_rng(options.seed)
     found = []
     for kind in KINDS:
         for i in rng.choice(len(samples), min(options.number, len(samples)), replace=False):
-            stack = samples[i].stack(manifest.catalogue)
+            stack = samples[i].stack(testset.world.catalogue)
             if kind == "less a block":
                 keep = np.arange(len(stack)) != rng.integers(len(stack))
                 stack = Stack(stack.shapes[keep], stack.poses[keep], stack.catalogue)
@@ -150,7 +149,7 @@ def tolerances(cases: Sequence[Case]) -> list[dict[str, Any]]:
     """Agreement by contact tolerance, with the safety margin."""
     rows = []
     for tolerance in TOLERANCES:
-        checker = EquilibriumChecker(contact_tolerance=tolerance)
+        checker = StaticsChecker(contact_tolerance=tolerance)
         for kind, some in groups(cases).items():
             said = np.array([checker.check(case.stack).stable for case in some])
             rows.append({"stacks": kind, "tolerance": tolerance, **compared(said, simulated(some))})
@@ -177,10 +176,10 @@ def unheld(cases: Sequence[Case]) -> dict[str, Any]:
 
 def times(stacks: Sequence[Stack]) -> dict[str, Any]:
     """Of a verdict with its margin, by number of blocks, and of the push."""
-    checker = EquilibriumChecker()
+    checker = StaticsChecker()
     each = np.array([milliseconds(lambda s=stack: checker.check(s)) for stack in stacks])  # type: ignore[misc]
     sizes = np.array([len(stack) for stack in stacks])
-    pushed = [milliseconds(lambda s=stack: checker.equilibrium(s, True)) for stack in stacks[:50]]  # type: ignore[misc]
+    pushed = [milliseconds(lambda s=stack: checker.answer(s, True)) for stack in stacks[:50]]  # type: ignore[misc]
     return {
         "mean": float(each.mean()),
         "by_blocks": {int(size): float(each[sizes == size].mean()) for size in np.unique(sizes)},
