@@ -7,12 +7,13 @@ import hashlib
 import numpy as np
 import pytest
 
-from stackgen.data.datamodule import TESTSET
-from stackgen.data.shards import SPLITS, Manifest, Sample
+from stackgen.data.dataset import TESTSET, Dataset
+from stackgen.data.manifest import SPLITS, Manifest
+from stackgen.data.shards import Sample
 from stackgen.geometry import block_vertices, silhouette
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD
 
 SHA256 = "c3adc506167a5404589a6acd1d3cdc03343a4c85f68971a12d470aede965fbc0"
 """Of its shard. It never changes: every figure ever published with its name would mean something else."""
@@ -20,12 +21,12 @@ SHA256 = "c3adc506167a5404589a6acd1d3cdc03343a4c85f68971a12d470aede965fbc0"
 
 @pytest.fixture(scope="module")
 def manifest() -> Manifest:
-    return Manifest.load(TESTSET)
+    return Dataset.open(TESTSET).manifest
 
 
 @pytest.fixture(scope="module")
 def samples(manifest: Manifest) -> list[Sample]:
-    return list(manifest.samples(TESTSET, "test"))
+    return list(Dataset.open(TESTSET).samples("test"))
 
 
 def test_it_is_the_frozen_one(manifest: Manifest) -> None:
@@ -40,8 +41,7 @@ def test_it_has_500_scenes_and_is_for_tests_alone(manifest: Manifest, samples: l
 
 
 def test_its_world_is_the_project_s(manifest: Manifest) -> None:
-    assert manifest.catalogue == PAPER_CATALOGUE and manifest.grid == PAPER_GRID
-    assert manifest.max_blocks == MAX_BLOCKS
+    assert manifest.world == PAPER_WORLD
     physics = dict(manifest.physics)
     assert physics.pop("engine") == "pybullet 3.2.7"
     assert Physics(**physics) == Physics()
@@ -49,7 +49,7 @@ def test_its_world_is_the_project_s(manifest: Manifest) -> None:
 
 def test_every_silhouette_is_that_of_its_stack(samples: list[Sample]) -> None:
     for sample in samples:
-        assert (silhouette(sample.stack(PAPER_CATALOGUE)) == sample.silhouette).all()
+        assert (silhouette(sample.stack(PAPER_CATALOGUE), PAPER_GRID) == sample.silhouette).all()
 
 
 def test_nothing_is_cut_off_and_everything_is_four_cells_high(samples: list[Sample]) -> None:
@@ -57,7 +57,7 @@ def test_nothing_is_cut_off_and_everything_is_four_cells_high(samples: list[Samp
         stack = sample.stack(PAPER_CATALOGUE)
         corners = np.concatenate(block_vertices(stack))
         assert corners[:, 2].max() == pytest.approx(4, abs=0.2)
-        wide = silhouette(stack, margin=16)
+        wide = silhouette(stack, PAPER_GRID, margin=16)
         assert np.count_nonzero(wide) == np.count_nonzero(sample.silhouette)
 
 

@@ -91,7 +91,7 @@ def test_duplicates_are_found_whatever_the_order_of_blocks(contents: Contents) -
         shapes[twin, :k], poses[twin, :k] = shapes[twin, :k][::-1].copy(), poses[twin, :k][::-1].copy()
     shapes[60], poses[60] = shapes[5], poses[5]
     poses[60, 1, 0] += 0.02
-    copied = StackArrays(shapes, poses, arrays.silhouettes, arrays.template)
+    copied = StackArrays(shapes, poses, arrays.silhouettes, arrays.template, arrays.num_shapes)
     twins = Contents(copied, contents.split, contents.depth, contents.manifest)
     assert duplicates(twins) == {"stacks": 3, "surplus": 2, "across splits": 3}
     assert duplicates(twins, same=0.03)["stacks"] == 4
