@@ -1,12 +1,13 @@
-"""stackgen completion: a script by which a shell completes verbs, options and their choices."""
+"""stackgen completion: print a script by which a shell completes verbs, options and their choices."""
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args, get_origin
+from typing import Literal
+
+from jsonargparse import ArgumentParser
 
 from stackgen.commands.cli import VERBS, usage
 from stackgen.commands.parsing import Command
@@ -15,34 +16,32 @@ Shell = Literal["bash", "zsh", "fish"]
 
 
 def main(shell: Shell = "bash") -> None:
-    """Print a script that completes stackgen's command line; the shell runs it at its start, no Python is started then.
+    """Print a script that completes stackgen's command line. The shell completes by it alone, without starting Python.
 
     Args:
-        shell: Whose language it is written in.
+        shell: Shell that the script is for.
     """
-    import shtab
-
-    sys.stdout.write(shtab.complete(skeleton(), shell) + "\n")
+    sys.stdout.write(whole_parser().get_completion_script(f"shtab-{shell}") + "\n")
 
 
-def skeleton() -> argparse.ArgumentParser:
-    """The whole command line as a plain parser: verbs, option names and choices, without types and defaults."""
-    root = argparse.ArgumentParser("stackgen", description=usage().splitlines()[2])
-    verbs = root.add_subparsers(dest="verb")
+def whole_parser() -> ArgumentParser:
+    """Make one parser of the whole command line."""
+    root = ArgumentParser(prog="stackgen", description=usage().splitlines()[2])
+    verbs = root.add_subcommands(required=False)
     for name, verb in VERBS.items():
         found = parsers_of(name)
-        plain = verbs.add_parser(name, help=verb.help, add_help=False)
         if isinstance(found, Mapping):
-            parts = plain.add_subparsers(dest="part")
+            verbs.add_subcommand(name, parent := ArgumentParser(), help=verb.help)
+            parts = parent.add_subcommands(required=False)
             for part, parser in found.items():
-                _copy_options(parser, parts.add_parser(part, add_help=False))
+                parts.add_subcommand(part, _with_files(parser))
         else:
-            _copy_options(found, plain)
+            verbs.add_subcommand(name, _with_files(found), help=verb.help)
     return root
 
 
-def parsers_of(verb: str) -> argparse.ArgumentParser | dict[str, argparse.ArgumentParser]:
-    """The parser of a verb; of a verb that has parts, theirs by name."""
+def parsers_of(verb: str) -> ArgumentParser | dict[str, ArgumentParser]:
+    """The parser of a verb; for a verb that has parts, their parsers by name."""
     module = importlib.import_module(VERBS[verb].module)
     if hasattr(module, "COMMAND"):
         return module.COMMAND.parser()
@@ -51,38 +50,15 @@ def parsers_of(verb: str) -> argparse.ArgumentParser | dict[str, argparse.Argume
     return module.parser_of(verb)
 
 
-def _copy_options(source: argparse.ArgumentParser, plain: argparse.ArgumentParser) -> None:
-    """Give a plain parser the options of one of ours."""
+def _with_files(parser: ArgumentParser) -> ArgumentParser:
+    """Let texts be completed as files: weights are given by a name or by a path."""
     import shtab
 
-    for action in source._actions:
-        kind = getattr(action, "_typehint", action.type)
-        help_text = (str(action.help) if action.help not in (None, argparse.SUPPRESS) else "").replace("%", "%%")
-        options: dict[str, Any] = {"help": help_text.partition(". ")[0]}
-        if action.nargs == 0:
-            options["action"] = "store_true"
-        elif choices := choices_of(kind):
-            options["choices"] = choices
-        if action.option_strings:
-            options["dest"] = action.option_strings[-1].lstrip("-")
-            copy = plain.add_argument(*action.option_strings, **options)
-        else:
-            copy = plain.add_argument(action.dest, **({"nargs": "*"} | options))
-        if action.nargs != 0 and "choices" not in options:
-            copy.complete = shtab.FILE  # type: ignore[attr-defined]
-
-
-def choices_of(kind: Any) -> list[str]:
-    """The values that a type has, if they can be listed.
-
-    >>> choices_of(Literal["a", "b"] | None), choices_of(bool), choices_of(int | str)
-    (['a', 'b'], ['true', 'false'], [])
-    """
-    if kind is bool:
-        return ["true", "false"]
-    if get_origin(kind) is Literal:
-        return [str(value) for value in get_args(kind)]
-    return [choice for part in get_args(kind) if get_origin(kind) is not dict for choice in choices_of(part)]
+    for action in parser._actions:
+        kind = getattr(action, "_typehint", None)
+        if kind in (str, str | None):
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
+    return parser
 
 
 COMMAND = Command(

@@ -17,12 +17,12 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    import shtab
+    from stackgen.commands.completion import whole_parser
 
-    from stackgen.commands.completion import skeleton
-
-    path = tmp_path_factory.mktemp("completion") / "stackgen.bash"
-    path.write_text(shtab.complete(skeleton(), "bash"))
+    folder = tmp_path_factory.mktemp("completion")
+    (folder / "weights.ckpt").touch()
+    path = folder / "stackgen.bash"
+    path.write_text(whole_parser().get_completion_script("shtab-bash"))
     return path
 
 
@@ -36,16 +36,18 @@ def script(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["dataset", "ver"], ["verify"]),
         (["sample", "--num_s"], ["--num_samples"]),
         (["sample", "--verify", "sim"], ["simulator"]),
+        (["sample", "--weights", "wei"], ["weights.ckpt"]),
+        (["check", "wei"], ["weights.ckpt"]),
     ],
 )
 def test_bash_completes_verbs_options_and_choices(script: Path, words: list[str], expected: list[str]) -> None:
     line = " ".join(["stackgen", *words])
     code = f"source {script}; COMP_WORDS=({line}); COMP_CWORD={len(words)}; _shtab_stackgen; echo ${{COMPREPLY[@]}}"
-    done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=False)
+    done = subprocess.run(["bash", "-c", code], capture_output=True, text=True, check=False, cwd=script.parent)
     assert done.stdout.split() == expected, done.stderr
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh"])
+@pytest.mark.parametrize("shell", ["zsh", "fish"])  # bash: above
 def test_the_script_is_printed(cli: Cli, shell: str) -> None:
     answer = cli("completion", "--shell", shell)
     assert answer.code == 0, answer.err
@@ -55,7 +57,7 @@ def test_the_script_is_printed(cli: Cli, shell: str) -> None:
 def test_files_are_laid_over_each_other_and_an_option_over_both(cli: Cli, tmp_path: Path) -> None:
     """Left to right; what refers to another option follows the last word on it."""
     (tmp_path / "a.yaml").write_text(
-        "name: a\nmodel: {class_path: stackgen.models.diffusion.module.DDPM, init_args: {draws: 2,"
+        "name: a\nmodel: {class_path: stackgen.models.DDPM, init_args: {draws: 2,"
         " denoiser: {width: 64, feedforward: 128, heads: 4}}}\ndata: {path: x, batch_size: 8,"
         " eval_batch_size: '${data.batch_size}'}\n"
     )
