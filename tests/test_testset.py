@@ -68,7 +68,7 @@ def test_no_scene_is_there_twice(samples: list[Sample]) -> None:
 
 def test_block_lists_are_varied(samples: list[Sample]) -> None:
     lengths = [len(sample.shapes) for sample in samples]
-    assert min(lengths) >= 4 and max(lengths) == MAX_BLOCKS
+    assert min(lengths) >= 4 and max(lengths) == PAPER_WORLD.max_blocks
     assert {int(s) for sample in samples for s in sample.shapes} == {0, 1, 2, 3}
 
 
