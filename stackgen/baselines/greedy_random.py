@@ -1,24 +1,25 @@
 """Greedy-Random (paper, "Greedy-Random Baseline"): fill the silhouette from the ground up with the longest blocks.
 
-Legend: H x W pixels, S shapes. A run is (left, right), the ends of a row of pixels without a gap [cell].
+Legend: H x W pixels, S shapes. A run is a row of pixels without a gap.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.baselines.heuristic import Heuristic, section
+from stackgen.baselines.heuristic import Heuristic, Interval, section
 from stackgen.baselines.swap import swap
 from stackgen.errors import StackgenError
 from stackgen.stack import Stack, shapes_of
-from stackgen.world import PAPER_WORLD, Grid, Mask, World
-
-Run = tuple[float, float]
+from stackgen.world import Grid, Mask
 
 
+@dataclass(frozen=True)
 class GreedyRandom(Heuristic):
     """Layer by layer from the ground up: the longest block that fits the longest run of pixels, at its left end.
 
@@ -27,30 +28,27 @@ class GreedyRandom(Heuristic):
     Blocks that fit nowhere are laid on the ground beside the structure.
 
     Args:
+        world: Shapes, scale of the silhouettes, and the longest block list it takes.
         sigma: Probability of the swap.
         tolerance: How much a block may be wider than its run [cell]; a run that is left over by no
             more is filled, and its block stands in its middle.
-        world: See Heuristic.
+
+    Raises:
+        StackgenError: If a number is out of its range.
     """
 
-    kind = "greedy-random"
+    kind: ClassVar[str] = "greedy-random"
 
-    def __init__(
-        self,
-        sigma: float = 0.6,
-        tolerance: float = 0.24,
-        world: World = PAPER_WORLD,
-    ) -> None:
-        super().__init__(world)
-        if not 0 <= sigma <= 1 or not 0 <= tolerance < 0.5:
+    sigma: float = 0.6
+    tolerance: float = 0.24
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.sigma <= 1 or not 0 <= self.tolerance < 0.5:
             raise StackgenError("greedy: sigma must lie in 0..1 and tolerance in 0..0.5")
-        self.sigma, self.tolerance = sigma, tolerance
-        self._sections = [section(shape) for shape in world.catalogue]
 
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Its numbers."""
-        return {"sigma": self.sigma, "tolerance": self.tolerance}
+    @cached_property
+    def _sections(self) -> list[float]:
+        return [section(shape) for shape in self.world.catalogue]
 
     def place(self, silhouette: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
         """Fill the silhouette, perhaps swap, and lay down what is left."""
@@ -58,7 +56,7 @@ class GreedyRandom(Heuristic):
         return self._with_the_rest(swap(structure, self.sigma, rng), left)
 
     def fill(self, silhouette: Mask, counts: NDArray[np.int64]) -> tuple[Stack, NDArray[np.int64]]:
-        """The structure, and the block list (S,) of what fits nowhere."""
+        """Make the structure, and the block list (S,) of what fits nowhere."""
         left = counts.copy()
         shapes: list[int] = []
         poses: list[list[float]] = []
@@ -77,13 +75,13 @@ class GreedyRandom(Heuristic):
                 runs = sorted([*runs, rest]) if rest else runs
         return Stack(np.array(shapes, dtype=np.int64), np.array(poses).reshape(-1, 6), self.world.catalogue), left
 
-    def _longest(self, left: NDArray[np.int64], run: Run) -> int | None:
-        """The longest block that is left and fits."""
+    def _longest(self, left: NDArray[np.int64], run: Interval) -> int | None:
+        """Choose the longest block that is left and fits."""
         fitting = [s for s, w in enumerate(self._sections) if left[s] and w <= run[1] - run[0] + self.tolerance]
         return max(fitting, key=lambda s: self._sections[s], default=None)
 
-    def _lay(self, shape: int, run: Run) -> tuple[float, Run | None]:
-        """Where a block stands in a run, and what it leaves of it."""
+    def _lay(self, shape: int, run: Interval) -> tuple[float, Interval | None]:
+        """Say where a block stands in a run, and what it leaves of it."""
         begin, end = run
         if end - begin - self._sections[shape] <= self.tolerance:
             return (begin + end) / 2, None
@@ -91,7 +89,7 @@ class GreedyRandom(Heuristic):
         return begin + width / 2, (begin + width, end) if begin + width < end else None
 
     def _with_the_rest(self, structure: Stack, left: NDArray[np.int64]) -> Stack:
-        """The structure, and the blocks that are left on the ground to its right, half a cell between all of them."""
+        """Lay the blocks that are left on the ground to the right, half a cell between all of them."""
         shapes, poses = list(structure.shapes), list(structure.poses)
         edge = self.world.grid.width / 2
         for shape in shapes_of(left).tolist():
@@ -102,8 +100,8 @@ class GreedyRandom(Heuristic):
         return Stack(np.array(shapes), np.array(poses), self.world.catalogue)
 
 
-def layer_runs(silhouette: Mask, level: int, grid: Grid) -> list[Run]:
-    """The runs of pixels at half the height of a layer, from left to right.
+def layer_runs(silhouette: Mask, level: int, grid: Grid) -> list[Interval]:
+    """Find the runs of pixels at half the height of a layer, from left to right.
 
     >>> layer_runs(np.pad(np.ones((14, 28), bool), ((46, 4), (18, 18))), 0, PAPER_GRID)
     [(-1.0, 1.0)]

@@ -8,7 +8,8 @@ from __future__ import annotations
 import hashlib
 import json
 from abc import ABC, abstractmethod
-from typing import Any
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,11 @@ from stackgen.geometry import row_intervals
 from stackgen.stack import Stack, check_block_list
 from stackgen.world import PAPER_WORLD, Mask, Shape, World
 
+Interval = tuple[float, float]
+"""Left and right end of a part of the x axis [cell]."""
 
+
+@dataclass(frozen=True)
 class Heuristic(ABC):
     """A StackSampler that places blocks by rules; every block of the list gets a pose.
 
@@ -29,20 +34,19 @@ class Heuristic(ABC):
         world: Shapes, scale of the silhouettes, and the longest block list it takes.
     """
 
-    kind: str
+    kind: ClassVar[str]
     """Its name on the command line."""
 
-    def __init__(self, world: World = PAPER_WORLD) -> None:
-        self.world = world
+    world: World = PAPER_WORLD
 
     @abstractmethod
     def place(self, silhouette: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
-        """One stack for a silhouette (H, W) and a block list (S,)."""
+        """Make one stack for a silhouette (H, W) and a block list (S,)."""
 
     @property
-    @abstractmethod
     def settings(self) -> dict[str, Any]:
         """Its numbers, as JSON allows."""
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "world"}
 
     @property
     def card(self) -> dict[str, Any]:
@@ -78,20 +82,20 @@ class Heuristic(ABC):
         return scenes
 
     def _largest_first(self, counts: NDArray[np.int64]) -> list[int]:
-        """Shape index of each block, the ones of most area first."""
+        """List the shape index of each block, the ones of most area first."""
         order = sorted(range(len(counts)), key=lambda s: (-self.world.catalogue[s].volume, s))
         return [s for s in order for _ in range(int(counts[s]))]
 
 
 def random_stream(seed: int, silhouette: Mask, counts: NDArray[np.int64], number: int) -> np.random.Generator:
-    """The random numbers of one sample of one scene."""
+    """Make the random numbers of one sample of one scene."""
     content = np.packbits(silhouette).tobytes() + np.asarray(counts, dtype="<i8").tobytes()
     scene = int.from_bytes(hashlib.sha256(content).digest()[:16], "little")
     return np.random.default_rng([seed, scene, number])
 
 
 def section(shape: Shape) -> float:
-    """Width of an upright block at half its height [cell].
+    """Measure the width of an upright block at half its height [cell].
 
     >>> section(PAPER_CATALOGUE[3])  # the triangle
     0.5

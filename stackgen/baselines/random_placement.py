@@ -7,33 +7,28 @@ ground or, at least in part, over a block of the layer below. Whether anything b
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.baselines.heuristic import Heuristic
+from stackgen.baselines.heuristic import Heuristic, Interval
 from stackgen.stack import Stack, shapes_of
 from stackgen.world import Mask
 
-Interval = tuple[float, float]
 
-
+@dataclass(frozen=True)
 class RandomPlacement(Heuristic):
     """Blocks in random order, each at a place drawn uniformly from all legal ones in the grid's layers.
 
     Only if there is none left, in the lowest layer above the grid that has one.
     """
 
-    kind = "random-placement"
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """It has none."""
-        return {}
+    kind: ClassVar[str] = "random-placement"
 
     def place(self, silhouette: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
-        """A legal stack of the block list; the silhouette is not looked at."""
+        """Make a legal stack of the block list; the silhouette is not looked at."""
         shapes = rng.permutation(shapes_of(counts))
         layers: list[list[Interval]] = [[] for _ in range(self.world.grid.height)]  # the blocks' extents
         poses = []
@@ -45,7 +40,7 @@ class RandomPlacement(Heuristic):
         return Stack(shapes, np.array(poses), self.world.catalogue)
 
     def _draw(self, width: float, layers: list[list[Interval]], rng: np.random.Generator) -> tuple[float, int]:
-        """Middle of the block [cell] and layer, uniform over the legal places; a layer is added if there are none."""
+        """Draw middle [cell] and layer, uniform over the legal places; a layer is added if there are none."""
         places = [(level, free) for level in range(len(layers)) for free in self.legal(width, level, layers)]
         if not places:
             layers.append([])
@@ -56,11 +51,11 @@ class RandomPlacement(Heuristic):
         return float(rng.uniform(begin, end)), level
 
     def legal(self, width: float, level: int, layers: Sequence[Sequence[Interval]]) -> list[Interval]:
-        """Where in a layer the middle of a block may be [cell], from left to right, no two intervals meeting.
+        """Find where in a layer the middle of a block may be [cell], from left to right, no two intervals meeting.
 
         Args:
-            width: Of the block [cell].
-            level: Of the layer.
+            width: Width of the block [cell].
+            level: Number of the layer.
             layers: Extents of the blocks that stand, for each layer.
         """
         half = max(0.0, (self.world.grid.width - width) / 2)
@@ -74,7 +69,7 @@ class RandomPlacement(Heuristic):
 
 
 def union(intervals: Iterable[Interval]) -> list[Interval]:
-    """The intervals with those that meet put together, from left to right.
+    """Put intervals that meet together, from left to right.
 
     >>> union([(2, 3), (0, 1), (0.5, 2)])
     [(0, 3)]
@@ -89,7 +84,7 @@ def union(intervals: Iterable[Interval]) -> list[Interval]:
 
 
 def _without(whole: Interval, hole: Interval) -> list[Interval]:
-    """What is left of a closed interval when an open one is taken out."""
+    """Take an open interval out of a closed one."""
     if hole[1] <= whole[0] or whole[1] <= hole[0]:
         return [whole]
     left, right = (whole[0], hole[0]), (hole[1], whole[1])

@@ -17,7 +17,7 @@ GAP = 0.5
 
 
 def swap(stack: Stack, sigma: float, rng: np.random.Generator) -> Stack:
-    """With probability sigma, two neighbouring cubes of a layer change places with a rectangle elsewhere.
+    """With probability sigma, let two neighbouring cubes of a layer change places with a rectangle elsewhere.
 
     One such change, drawn uniformly from all that are possible; the stack as it is if none is. The
     rectangle's middle goes to the middle of the pair, the cubes side by side to where the rectangle was.
@@ -30,7 +30,7 @@ def swap(stack: Stack, sigma: float, rng: np.random.Generator) -> Stack:
 
 
 def swaps(stack: Stack) -> list[tuple[int, int, int]]:
-    """All (left cube, right cube, rectangle) that can change places."""
+    """List all (left cube, right cube, rectangle) that can change places."""
     widths = np.array([shape.size[0] if shape.is_box else np.nan for shape in stack.catalogue])[stack.shapes]
     x, z = stack.poses[:, 0], stack.poses[:, 2]
     pairs = [
@@ -42,7 +42,7 @@ def swaps(stack: Stack) -> list[tuple[int, int, int]]:
 
 
 def exchange(stack: Stack, left: int, right: int, rectangle: int) -> Stack:
-    """Two cubes and a rectangle with their places exchanged."""
+    """Exchange the places of two cubes and a rectangle."""
     poses: NDArray[np.float64] = stack.poses.copy()
     poses[rectangle] = (stack.poses[left] + stack.poses[right]) / 2
     poses[[left, right]] = stack.poses[rectangle]

@@ -22,12 +22,13 @@ Integers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Span:
+class Cover:
     """The pixels that a block covers at each of n places.
 
     Args:
         rows: (R,) rows of pixels.
-        start, stop: (n, R) first column, and the one after the last; equal where there is none.
+        start: (n, R) first column.
+        stop: (n, R) column after the last; equal to `start` where there is none.
     """
 
     rows: Integers
@@ -35,23 +36,23 @@ class Span:
     stop: Integers
 
     def sum(self, running: Integers) -> Integers:
-        """(n,) sums of a picture over the pixels covered, from its running sums (see :func:`running_sums`)."""
+        """Sum a picture over the pixels covered (n,), given its running sums (see :func:`running_sums`)."""
         return (running[self.rows, self.stop] - running[self.rows, self.start]).sum(axis=1)
 
-    def beside(self, reach: int, width: int) -> tuple[Span, Span]:
-        """The `reach` pixels to the left and to the right in each row covered, as far as a picture of `width` goes."""
+    def beside(self, reach: int, width: int) -> tuple[Cover, Cover]:
+        """Take the `reach` pixels to the left and to the right in each row, as far as a picture of `width` goes."""
         some = reach * (self.stop > self.start)
         left, right = np.maximum(self.start - some, 0), np.minimum(self.stop + some, width)
-        return Span(self.rows, left, self.start), Span(self.rows, self.stop, right)
+        return Cover(self.rows, left, self.start), Cover(self.rows, self.stop, right)
 
-    def take(self, indices: ArrayLike) -> Span:
-        """Some of the places."""
+    def take(self, indices: ArrayLike) -> Cover:
+        """Take some of the places."""
         i = np.asarray(indices)
-        return Span(self.rows, self.start[i], self.stop[i])
+        return Cover(self.rows, self.start[i], self.stop[i])
 
 
-def span(shape: Shape, x: ArrayLike, z: float, grid: Grid) -> Span:
-    """The pixels of the front view that an upright block covers with its frame at each (x, z) [cell], x (n,).
+def cover(shape: Shape, x: ArrayLike, z: float, grid: Grid) -> Cover:
+    """Find the pixels of the front view that an upright block covers with its frame at each (x, z) [cell], x (n,).
 
     A pixel is covered when its centre is, as :func:`stackgen.geometry.silhouette` has it.
     """
@@ -61,7 +62,7 @@ def span(shape: Shape, x: ArrayLike, z: float, grid: Grid) -> Span:
     start = np.ceil((places + left) * grid.pixels_per_cell + middle).astype(np.int64)
     stop = np.floor((places + right) * grid.pixels_per_cell + middle).astype(np.int64) + 1
     start = np.clip(start, 0, last)
-    return Span(rows, start, np.clip(stop, start, last))
+    return Cover(rows, start, np.clip(stop, start, last))
 
 
 def running_sums(picture: ArrayLike) -> Integers:

@@ -69,12 +69,12 @@ def read_weights(
 
 
 def resolve(weights: str | Path, role: str = "sampler", other_names: Sequence[str] = ()) -> Path:
-    """The file that weights stand for: a name in the package, a `.safetensors` or `.ckpt` file, or a run's folder.
+    """Find the file that weights stand for: a name in the package, a `.safetensors` or `.ckpt` file, or a run folder.
 
     Args:
         weights: Name or path.
-        role: `sampler` or `predictor`: what the name `default` means.
-        other_names: Names that the caller knows besides, for the message.
+        role: Meaning of the name `default`: `sampler` or `predictor`.
+        other_names: Further names that the caller knows, for the message.
 
     Raises:
         StackgenError: If there is none; the message lists the names there are.
@@ -98,7 +98,7 @@ def resolve(weights: str | Path, role: str = "sampler", other_names: Sequence[st
 
 
 def last_checkpoint(folder: Path) -> Path:
-    """The newest `last.ckpt` of a run (all its versions) or of one version.
+    """Find the newest `last.ckpt` of a run (all its versions) or of one version.
 
     Raises:
         StackgenError: If there is none.
@@ -123,10 +123,10 @@ def export_checkpoint(
     """Write a checkpoint's weights (the averaged ones, where EMA ran) as safetensors with a card; returns the card.
 
     Args:
-        checkpoint: Of a training.
-        out: The .safetensors file; the card goes beside it.
-        metrics: To be quoted in the card.
-        half: Store matrices as 16-bit floats: half the size, computed with as 32-bit ones.
+        checkpoint: Checkpoint of a training.
+        out: The .safetensors file to write; the card goes beside it.
+        metrics: Metrics to quote in the card.
+        half: Whether matrices are stored as 16-bit floats: half the size; they are computed with as 32-bit ones.
 
     Raises:
         StackgenError: If the checkpoint is not ours, or `out` is not a `.safetensors` path.
@@ -169,7 +169,7 @@ def _read_bytes(path: Path) -> bytes:
 
 
 Maker = Callable[[dict[str, Any], World], tuple[nn.Module, Callable[..., Any]]]
-"""Configuration and world of a card to an empty network, and what makes a sampler or predictor of it."""
+"""From configuration and world of a card to an empty network, and the class of its sampler or predictor."""
 
 
 def build(weights: str | Path, card: dict[str, Any], tensors: dict[str, Tensor], maker: Maker) -> Any:
@@ -177,9 +177,9 @@ def build(weights: str | Path, card: dict[str, Any], tensors: dict[str, Tensor],
 
     Args:
         weights: Where they come from, for messages.
-        card: See the module.
-        tensors: The state of the network.
-        maker: Of the card's kind.
+        card: What is known about them.
+        tensors: State of the network.
+        maker: Maker of the card's kind.
 
     Raises:
         StackgenError: If card and tensors do not fit each other.

@@ -1,4 +1,4 @@
-"""Structures that do not stand on the cells of the grid, for samplers that know no others."""
+"""Structures that do not stand on the cells of the grid, for samplers that know only those that do."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ class AlignedSampler:
 
     @property
     def world(self) -> World:
-        """The world of the other sampler."""
+        """World of the other sampler."""
         return self.sampler.world
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """The settings of the other sampler."""
+        """Settings of the other sampler."""
         return self.sampler.settings
 
     @property
     def card(self) -> Mapping[str, Any]:
-        """The card of the other sampler."""
+        """Card of the other sampler."""
         return self.sampler.card
 
     def sample_batch(

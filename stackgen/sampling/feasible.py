@@ -1,4 +1,4 @@
-"""Layouts, and the block lists that can make a silhouette row by row."""
+"""Layouts of stacks, and the block lists that can make a silhouette row by row."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stackgen.baselines.heuristic import Interval, section
 from stackgen.errors import StackgenError
 from stackgen.stack import Stack
 from stackgen.world import Catalogue, Grid, Mask, Shape, World
@@ -19,7 +20,7 @@ Layout = tuple[tuple[int, ...], ...]
 
 
 def layout(stack: Stack, grid: Grid) -> Layout:
-    """Per-layer block lists, bottom layer first (SPEC: nearest layer of a block's centre, left to right by x).
+    """List the shapes of each layer, bottom layer first (SPEC: nearest layer of a block's centre, left to right by x).
 
     >>> stack = Stack([0, 1, 0], [[1, 0, 0.5, 0, 0, 0], [0, 0, 1.6, 0, 0, 0], [-1, 0, 0.4, 0, 0, 0]])
     >>> layout(stack, Grid())
@@ -37,7 +38,7 @@ displacement, settling, tilt and whole pixels do. Less than half the step betwee
 
 
 def can_make(silhouette: ArrayLike, counts: ArrayLike, world: World) -> bool:
-    """Whether a block list can make a silhouette, its blocks lying in rows of cells.
+    """Say whether a block list can make a silhouette, its blocks lying in rows of cells.
 
     At half height of each row the silhouette is cut into runs of pixels; the blocks of the list must
     fill all runs, each block once. Shapes that taper (the triangle is half as wide there) never touch
@@ -47,7 +48,7 @@ def can_make(silhouette: ArrayLike, counts: ArrayLike, world: World) -> bool:
     Args:
         silhouette: (H, W).
         counts: (S,) block list.
-        world: With shapes one cell high.
+        world: Shapes, each one cell high, and grid.
 
     Raises:
         StackgenError: If a shape of the list is not one cell high.
@@ -57,7 +58,7 @@ def can_make(silhouette: ArrayLike, counts: ArrayLike, world: World) -> bool:
 
 
 def lists_that_make(silhouette: ArrayLike, limit: ArrayLike, world: World) -> set[tuple[int, ...]]:
-    """All block lists of at most `limit` (S,) of each shape that can make a silhouette; see :func:`can_make`."""
+    """Find all block lists of at most `limit` (S,) of each shape that can make a silhouette; see :func:`can_make`."""
     most = tuple(int(c) for c in np.asarray(limit))
     shapes = zip(world.catalogue, most, strict=True)
     sections = tuple(cross_section(shape) if c else (np.inf, True) for shape, c in shapes)
@@ -70,25 +71,20 @@ def lists_that_make(silhouette: ArrayLike, limit: ArrayLike, world: World) -> se
 
 
 def has_plain_rows(catalogue: Catalogue) -> bool:
-    """Whether all shapes are one cell high, so that :func:`can_make` can answer."""
+    """Say whether all shapes are one cell high, so that :func:`can_make` can answer."""
     return all(abs(shape.size[2] - 1) < 1e-6 for shape in catalogue)
 
 
 def cross_section(shape: Shape) -> tuple[float, bool]:
-    """Width at half height [cell], and whether the shape is narrower there than its box."""
+    """Measure the width at half height [cell], and say whether the shape is narrower there than its box."""
     width, _, height = shape.size
     if abs(height - 1) > 1e-6:
         raise StackgenError(f"block lists can be matched with silhouettes for shapes one cell high, not {shape.name!r}")
-    corners = np.asarray(shape.outline, dtype=float)
-    following = np.roll(corners, -1, axis=0)
-    crossing = (corners[:, 1] > 0) != (following[:, 1] > 0)
-    a, b = corners[crossing], following[crossing]
-    x = a[:, 0] + a[:, 1] / (a[:, 1] - b[:, 1]) * (b[:, 0] - a[:, 0])
-    return float(np.ptp(x)), bool(np.ptp(x) < width - 1e-6)
+    return section(shape), section(shape) < width - 1e-6
 
 
-def row_runs(silhouette: Mask, grid: Grid) -> list[list[tuple[float, float]]]:
-    """For each row of cells, from the ground up, the runs of pixels at half height: their ends in x [cell]."""
+def row_runs(silhouette: Mask, grid: Grid) -> list[list[Interval]]:
+    """Find the runs of pixels at half height of each row of cells, from the ground up."""
     z, x = grid.vertical("front"), grid.horizontal()
     half = 0.5 / grid.pixels_per_cell
     rows = []
@@ -104,7 +100,7 @@ def row_runs(silhouette: Mask, grid: Grid) -> list[list[tuple[float, float]]]:
 
 @lru_cache(maxsize=4096)
 def _fillings(width: float, sections: tuple[tuple[float, bool], ...]) -> frozenset[tuple[int, ...]]:
-    """Block lists that fill a run: one tapering shape, or boxes side by side."""
+    """Find the block lists that fill a run: one tapering shape, or boxes side by side."""
     alone = {i for i, (w, tapers) in enumerate(sections) if tapers and abs(w - width) <= RUN_TOLERANCE}
     found = {tuple(int(i == j) for j in range(len(sections))) for i in alone}
 

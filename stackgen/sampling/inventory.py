@@ -1,7 +1,7 @@
-"""Build it with what is on the table: the block lists that an inventory allows.
+"""The block lists that an inventory allows.
 
-An inventory is a number of blocks of each shape, more than one structure needs or fewer. Which of the lists
-it allows can make a silhouette is searched; the network says which of them is the most likely.
+An inventory is the number of blocks of each shape on the table, more than one structure needs or fewer. A search
+finds which of the lists it allows can make a silhouette; the network says which of these are the most likely.
 
 Legend: S shapes, H x W pixels, T block lists.
 """
@@ -23,14 +23,14 @@ Inventory = str | Mapping[str, int] | NDArray[np.int64]
 """`"cube=4,rectangle=3"`, `{"cube": 4, "rectangle": 3}` or counts (S,) in catalogue order."""
 
 MOST = 10**6
-"""Blocks of an inventory, at most."""
+"""Largest number of blocks of an inventory."""
 
 _RANKED = 64  # lists that the network is asked for; what can be made but is not among them comes after
 _SLACK = 0.5  # area that a silhouette may be larger than its blocks [cell]: displacement, gaps, whole pixels
 
 
 def inventory_counts(inventory: Inventory, catalogue: Catalogue) -> NDArray[np.int64]:
-    """(S,) counts of an inventory in any of its forms.
+    """Give the counts (S,) of an inventory in any of its forms.
 
     Raises:
         StackgenError: On an unknown shape, a negative number, or no block at all.
@@ -51,7 +51,7 @@ def inventory_counts(inventory: Inventory, catalogue: Catalogue) -> NDArray[np.i
         raise StackgenError(str(error).replace("block list", "inventory", 1)) from error
     if counts.shape != (len(catalogue),) or (counts < 0).any() or not 1 <= counts.sum() <= MOST:
         names = ", ".join(catalogue.names)
-        raise StackgenError(f"inventory: at least one block in all, 0 or more of each of {names}, got {inventory!r}")
+        raise StackgenError(f"inventory: give 0 or more of each of {names}, at least one in all, got {inventory!r}")
     return counts
 
 
@@ -62,17 +62,17 @@ def allowed_lists(
     predictor: Callable[[], BlockListPredictor] | None = None,
     top: int = 1,
 ) -> NDArray[np.int64]:
-    """The block lists that an inventory allows and that can make a silhouette, the most likely first.
+    """Find the block lists that an inventory allows and that can make a silhouette, the most likely first.
 
     Lists that the network does not know come after those it does, few blocks first. A silhouette that
     no blocks fill row by row, such as a drawing between the lines, is left to the network alone.
 
     Args:
         silhouette: (H, W), on the cells of the grid.
-        inventory: (S,) counts.
-        world: Shapes, grid and most blocks of a stack.
-        predictor: Makes what ranks lists; None for a model without.
-        top: How many lists, at most.
+        inventory: (S,) number of blocks of each shape.
+        world: Shapes, grid and longest block list.
+        predictor: Function that makes the predictor which ranks lists; None where there is none.
+        top: Largest number of lists.
 
     Returns:
         (T, S), at least one.
@@ -99,7 +99,7 @@ def allowed_lists(
 
 
 def _fitting(silhouette: Mask, limit: NDArray[np.int64], world: World) -> set[tuple[int, ...]] | None:
-    """Block lists that can make the silhouette; None where that cannot be told for these shapes."""
+    """Find the block lists that can make the silhouette; None where that cannot be told for these shapes."""
     try:
         found = lists_that_make(silhouette, limit, world)
     except StackgenError:
@@ -128,7 +128,7 @@ def _check_area(silhouette: Mask, inventory: NDArray[np.int64], world: World) ->
 
 
 def _what_is_missing(inventory: NDArray[np.int64], lists: set[tuple[int, ...]], catalogue: Catalogue) -> str:
-    """One line about the list that lacks the least."""
+    """Write one line about the list that lacks the least."""
 
     def lacking(counts: tuple[int, ...]) -> NDArray[np.int64]:
         return np.maximum(np.array(counts) - inventory, 0)

@@ -1,6 +1,6 @@
-"""Every method by name: heuristics, and the networks behind weights.
+"""Methods by name: heuristics, and the networks behind weights.
 
-torch is imported where weights are read, so that a heuristic is had without it.
+torch is imported only where weights are read, so that a heuristic needs none.
 """
 
 from __future__ import annotations
@@ -12,24 +12,25 @@ from typing import TYPE_CHECKING, Any
 from stackgen.baselines import HEURISTICS
 from stackgen.errors import StackgenError
 from stackgen.protocols import BlockListPredictor, StackSampler
+from stackgen.world import PAPER_WORLD
 
 if TYPE_CHECKING:
     from stackgen.models.weights import Maker
 
 
 def load_sampler(weights: str | Path = "default") -> StackSampler:
-    """The sampler behind a name (of a heuristic or of weights), a `.safetensors` or `.ckpt` file, or a run's folder.
+    """Load the sampler behind a name (of a heuristic or of weights), a `.safetensors` or `.ckpt` file, or a run folder.
 
     Raises:
         StackgenError: If there is no such thing, or it holds something else.
     """
     if str(weights) in HEURISTICS:
-        return HEURISTICS[str(weights)]()
+        return HEURISTICS[str(weights)](PAPER_WORLD)
     return _load(weights, "sampler", _samplers())
 
 
 def load_predictor(weights: str | Path = "default") -> BlockListPredictor:
-    """The block-list predictor behind a name of weights, a `.safetensors` or `.ckpt` file, or a run's folder.
+    """Load the block-list predictor behind a name of weights, a `.safetensors` or `.ckpt` file, or a run folder.
 
     Raises:
         StackgenError: If there is no such thing, or it holds something else.
@@ -38,7 +39,7 @@ def load_predictor(weights: str | Path = "default") -> BlockListPredictor:
 
 
 def role_of(weights: str | Path) -> str:
-    """`predictor` where a name, file or checkpoint of ours holds a block-list network, else `sampler`.
+    """Say what a name, file or checkpoint holds: `predictor` for a block-list network, else `sampler`.
 
     Raises:
         StackgenError: If there is no such thing or it is damaged.

@@ -1,7 +1,7 @@
 """Verified sampling: draw many stacks, check them, keep the best.
 
-The paper measures the first stack that comes out. With a checker at hand one may draw more than is asked
-for and keep what stands and matches. That is another question, so its metrics are a row of their own.
+The paper measures the first stack that comes out. With a checker at hand, one can draw more than is asked
+for and keep what stands and matches. That is another question, so it has a row of its own in the tables.
 
 Legend: B scenes, n stacks asked for, S shapes, H x W pixels.
 """
@@ -31,10 +31,10 @@ MATCH = 0.95
 """Front IoU from which a standing stack is good enough to stop looking for a better one."""
 
 FIRST_ROUND = 8
-"""Stacks drawn for a scene in the first round, at least; every later round draws as many as all before it."""
+"""Smallest number of stacks drawn for a scene in the first round; every later round draws as many as all before."""
 
 MOST_DRAWS = 4096
-"""Stacks drawn for a scene where time alone is the limit."""
+"""Largest number of stacks drawn for a scene where time alone is the limit."""
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Budget:
     """What may be spent on a scene.
 
     Args:
-        draws: Stacks drawn, at most. Same seed, same answer.
-        seconds: Time [s], where it is not null; a round is not begun if it would end too late. The answer
+        draws: Largest number of stacks drawn. The same seed gives the same answer.
+        seconds: Time [s], where it is not null; a round does not begin if it would end too late. The answer
             then depends on the machine.
 
     Raises:
@@ -59,7 +59,7 @@ class Budget:
 
     @staticmethod
     def parse(text: str) -> Budget:
-        """From a time or a number of draws.
+        """Read a budget from a time or a number of draws.
 
         Raises:
             StackgenError: If it is neither.
@@ -81,10 +81,10 @@ class Candidate:
     """A stack that was drawn and checked.
 
     Args:
-        stack: As drawn.
-        verdict: What the checker says.
-        front_iou: Of the settled stack with the target; of an unstable one as it was drawn.
-        layout: Of the stack as drawn.
+        stack: Stack as drawn.
+        verdict: Verdict of the checker.
+        front_iou: Front IoU of the settled stack with the target; of an unstable one, as it was drawn.
+        layout: Layout of the stack as drawn.
     """
 
     stack: Stack
@@ -104,7 +104,7 @@ class Candidate:
 
     @property
     def rank(self) -> tuple[bool, int, float]:
-        """The better, the larger: stable, few blocks fallen, like the target."""
+        """Key that is larger for better candidates: stable, few blocks fallen, like the target."""
         return self.verdict.stable, -int(np.count_nonzero(self.verdict.fell)), self.front_iou
 
 
@@ -114,9 +114,9 @@ class Choice:
 
     Args:
         chosen: n candidates, the best first.
-        drawn: Stacks drawn.
-        checked: Of them, how many the checker was asked about.
-        stable: Of those, how many it says will stand.
+        drawn: Number of stacks drawn.
+        checked: Number of these that were checked.
+        stable: Number of those that stand.
     """
 
     chosen: tuple[Candidate, ...]
@@ -126,14 +126,14 @@ class Choice:
 
     @property
     def valid(self) -> int:
-        """How many of the chosen stand and are like the target at all."""
+        """Number of the chosen that stand and are like the target at all."""
         return sum(candidate.valid for candidate in self.chosen)
 
 
 def best(candidates: Sequence[Candidate], number: int) -> tuple[Candidate, ...]:
-    """The best of some candidates, the best first: those that match, of distinct layouts as far as there are.
+    """Choose the best candidates, the best first: those that match, of distinct layouts as far as there are.
 
-    What stands but does not match comes after them, and what falls last.
+    What stands but does not match comes after them, and what falls comes last.
     """
     ranked = sorted(candidates, key=lambda candidate: candidate.rank, reverse=True)
     again = _repetitions([candidate.layout for candidate in ranked])
@@ -142,7 +142,7 @@ def best(candidates: Sequence[Candidate], number: int) -> tuple[Candidate, ...]:
 
 
 def _repetitions(layouts: Sequence[Layout]) -> list[int]:
-    """How many of the same layout come before each."""
+    """Count how many of the same layout come before each."""
     seen: Counter[Layout] = Counter()
     numbers = []
     for item in layouts:
@@ -153,7 +153,7 @@ def _repetitions(layouts: Sequence[Layout]) -> list[int]:
 
 @dataclass
 class _Search:
-    """What is known of one scene on the way."""
+    """What is known of one scene during the search."""
 
     target: Mask
     wanted: int
@@ -163,7 +163,7 @@ class _Search:
 
     @property
     def missing(self) -> int:
-        """Matching stacks that are not found yet."""
+        """Number of matching stacks that are not found yet."""
         return max(0, self.wanted - sum(candidate.matches for candidate in self.checked))
 
     def add(self, stacks: Sequence[Stack], grid: Grid) -> None:
@@ -179,7 +179,7 @@ class _Search:
         self.drawn += len(stacks)
 
     def take(self) -> list[tuple[Stack, Layout]]:
-        """The next draws to be checked: as many as are missing."""
+        """Take the next draws to be checked: as many as are missing."""
         number = self.missing
         taken, self.queue = self.queue[:number], self.queue[number:]
         return taken
@@ -190,7 +190,7 @@ class _Search:
         self.checked.append(Candidate(stack, verdict, silhouette_iou(shown, self.target, grid), kind))
 
     def choice(self) -> Choice:
-        """What it came to."""
+        """Sum up the search."""
         stable = sum(candidate.verdict.stable for candidate in self.checked)
         return Choice(best(self.checked, self.wanted), self.drawn, len(self.checked), stable)
 
@@ -208,14 +208,14 @@ class _Clock:
         return self.seconds is not None and time.perf_counter() - self.began >= self.seconds
 
     def another_round(self, larger: float) -> bool:
-        """Whether there is time for a round so many times as large as the last; called before each but the first."""
+        """Say whether a round `larger` times as large as the last fits; to be called before each but the first."""
         now = time.perf_counter()
         last, self.lap = now - self.lap, now
         return self.seconds is None or now - self.began + larger * last <= self.seconds
 
 
 def checker_named(name: CheckerName, simulator: StabilityChecker) -> StabilityChecker:
-    """The checker that verified sampling asks while it draws: the simulator, or statics with its physics.
+    """Make the checker that verified sampling asks while it draws: the simulator, or statics with its physics.
 
     Raises:
         StackgenError: If there is no such checker.
@@ -223,9 +223,9 @@ def checker_named(name: CheckerName, simulator: StabilityChecker) -> StabilityCh
     if name == "simulator":
         return simulator
     if name == "statics":
-        from stackgen.sim.statics.checker import EquilibriumChecker  # loads a solver that nothing else needs
+        from stackgen.sim.statics.checker import StaticsChecker  # loads a solver that nothing else needs
 
-        return EquilibriumChecker(simulator.physics)  # type: ignore[arg-type]
+        return StaticsChecker(simulator.physics)  # type: ignore[arg-type]
     raise StackgenError(f"verify: the checker is simulator or statics, not {name!r}")
 
 
@@ -238,10 +238,10 @@ class VerifiedSampler:
     sampler must answer: `choose` says which is which.
 
     Args:
-        sampler: Draws the stacks.
-        checker: Says which stand.
-        budget: For each scene; time is shared by the scenes of a batch.
-        name: The checker's name, for the record.
+        sampler: Sampler that draws the stacks.
+        checker: Checker that says which stand.
+        budget: Budget of each scene; time is shared by the scenes of a batch.
+        name: Name of the checker, for the record.
     """
 
     def __init__(
@@ -255,12 +255,12 @@ class VerifiedSampler:
 
     @property
     def world(self) -> World:
-        """The world of the sampler that draws."""
+        """World of the sampler that draws."""
         return self.sampler.world
 
     @property
     def card(self) -> Mapping[str, Any]:
-        """The card of the sampler that draws."""
+        """Card of the sampler that draws."""
         return self.sampler.card
 
     @cached_property
@@ -277,10 +277,10 @@ class VerifiedSampler:
         return [[candidate.stack for candidate in choice.chosen] for choice in choices]
 
     def choose(self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int) -> list[Choice]:
-        """As `sample_batch`, with verdicts, and what was spent.
+        """Sample as `sample_batch` does, and give the verdicts and what was spent, too.
 
         Raises:
-            StackgenError: As the sampler does.
+            StackgenError: If the sampler raises it, or no stack is asked for.
         """
         if num_samples < 1:
             raise StackgenError(f"the number of samples must be at least 1, got {num_samples}")
@@ -303,7 +303,7 @@ class VerifiedSampler:
         return [search.choice() for search in searches]
 
     def _check(self, searches: Sequence[_Search], clock: _Clock) -> None:
-        """Check what is queued, of each scene only as many as it still misses, until nothing is missing."""
+        """Check queued stacks, of each scene only as many as it still misses, until nothing is missing."""
         while True:
             wave = [(search, *item) for search in searches for item in search.take()]
             if not wave:
@@ -318,19 +318,19 @@ class VerifiedSampler:
 def choose_list(
     sampler: VerifiedSampler, silhouette: Mask, lists: NDArray[np.int64], num_samples: int, seed: int
 ) -> tuple[NDArray[np.int64], Choice, int]:
-    """Choose among block lists too: the next one is tried where too little that is valid stands with those before.
+    """Choose among block lists too: try the next one where too few valid stacks were found with those before.
 
-    Every list has the whole number of draws; of the time each has half of what is left, the last all of it.
+    Every list has the whole number of draws; each has half of the time that is left, and the last all of it.
 
     Args:
-        sampler: Draws, checks and has a budget.
-        silhouette: (H, W).
-        lists: (T, S), the most likely first.
-        num_samples: n.
-        seed: Same seed, same answer, unless time is the budget.
+        sampler: Sampler that draws and checks, and its budget.
+        silhouette: (H, W) target.
+        lists: (T, S) block lists, the most likely first.
+        num_samples: Number of stacks n.
+        seed: Seed; the same one gives the same answer, unless time is the budget.
 
     Returns:
-        The block list (S,), what was chosen with it and was spent on all lists, and how many were tried.
+        Block list (S,), what was chosen with it and was spent on all lists, and how many were tried.
     """
     tried: list[Choice] = []
     seconds, began = sampler.budget.seconds, time.perf_counter()

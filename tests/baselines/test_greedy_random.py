@@ -81,7 +81,7 @@ def test_nothing_to_see_is_no_error() -> None:
 def test_settings_that_mean_nothing_are_refused() -> None:
     for sigma, tolerance in ((-0.1, 0.24), (1.1, 0.24), (0.6, 0.5), (0.6, -0.1)):
         with pytest.raises(StackgenError, match="greedy"):
-            GreedyRandom(sigma, tolerance)
+            GreedyRandom(sigma=sigma, tolerance=tolerance)
 
 
 # The swap.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stackgen.baselines.heuristic import section
-from stackgen.baselines.upright import running_sums, span
+from stackgen.baselines.upright import cover, running_sums
 from stackgen.geometry import silhouette
 from stackgen.stack import Stack
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Grid
@@ -20,7 +20,7 @@ def test_a_span_is_the_block_s_silhouette(shape: int, grid: Grid) -> None:
     rng = np.random.default_rng(shape)
     x, z = rng.uniform(-4, 4, 40), 1.37
     weights = rng.integers(-5, 6, (64, 64))
-    covered = span(PAPER_CATALOGUE[shape], x, z, grid)
+    covered = cover(PAPER_CATALOGUE[shape], x, z, grid)
     sums = covered.sum(running_sums(weights))
     for i, place in enumerate(x):
         picture = silhouette(Stack(np.array([shape]), np.array([[place, 0, z, 0, 0, 0]])), grid)
@@ -33,7 +33,7 @@ def test_a_span_is_the_block_s_silhouette(shape: int, grid: Grid) -> None:
 
 def test_beside_are_the_pixels_next_to_the_rows_covered() -> None:
     cube = PAPER_CATALOGUE[0]
-    covered = span(cube, [0.0, 2.0, 40.0], 0.5, PAPER_GRID)  # in the middle, at the edge, outside
+    covered = cover(cube, [0.0, 2.0, 40.0], 0.5, PAPER_GRID)  # in the middle, at the edge, outside
     left, right = covered.beside(3, 64)
     everywhere = running_sums(np.ones((64, 64)))
     assert covered.sum(everywhere).tolist() == [14 * 14, 14 * 11, 0]

@@ -17,7 +17,7 @@ from stackgen.errors import StackgenError
 from stackgen.models import weights as module
 from stackgen.models.weights import export_checkpoint, read_weights, resolve, write_weights
 from stackgen.sampling.methods import load_predictor, load_sampler
-from stackgen.world import PAPER_CATALOGUE
+from stackgen.world import PAPER_WORLD
 from tests.conftest import TinyWeights
 
 
@@ -66,8 +66,7 @@ def test_weights_are_read_back_as_written(tmp_path: Path) -> None:
 def test_loaded_weights_carry_their_world(tiny: TinyWeights) -> None:
     for made in (load_sampler(tiny.sampler), load_predictor(tiny.predictor)):
         loaded: Any = made
-        assert loaded.catalogue == PAPER_CATALOGUE and loaded.max_blocks == 10
-        assert loaded.grid.image_size == 64 and loaded.card["format"] == module.FORMAT
+        assert loaded.world == PAPER_WORLD and loaded.card["format"] == module.FORMAT
     picture = np.zeros((1, 64, 64), bool)
     scenes = load_sampler(tiny.sampler).sample_batch(picture, np.array([[2, 0, 0, 1]]), 2, 0)
     assert [stack.counts.tolist() for stack in scenes[0]] == [[2, 0, 0, 1]] * 2

@@ -16,10 +16,7 @@ from torch.nn import functional as F
 
 from stackgen.data.preferences import Preferences
 from stackgen.models.diffusion.module import DDPM
-from stackgen.models.diffusion.network import DiffusionConfig, PoseDiffusion
-from stackgen.models.diffusion.schedules import ScheduleConfig
-from stackgen.models.optimization import OptimizerConfig
-from stackgen.models.transformer import TransformerConfig
+from stackgen.models.diffusion.network import PoseDiffusion
 
 _REFERENCE = "reference"
 _OTHER = 2**32
@@ -27,35 +24,22 @@ _OTHER = 2**32
 
 
 class VerdictTuning(DDPM):
-    """A DDPM that learns from pairs too; begin from trained weights, with `stackgen.training.StartFrom`.
+    """A DDPM that learns from pairs too; it begins from trained weights, by `stackgen.training.StartFrom`.
 
     Its checkpoints are those of a DDPM.
 
     Args:
         preferences: File of pairs that `stackgen prefer` wrote.
-        denoiser: Architecture of the denoiser.
-        schedule: Noise schedule.
-        diffusion: Target of the training and normalisation of the poses.
-        optimizer: Learning rate and its course over the training.
-        draws: Number of noise draws of each sample in a training step.
         beta: Sharpness of the preference; a large one keeps the network near where it began.
         weight: Weight of the pairs' loss beside the data's.
         pairs: Number of pairs in each step, with two noise draws each.
+        ddpm: Arguments of DDPM.
     """
 
     def __init__(
-        self,
-        preferences: str,
-        denoiser: TransformerConfig = TransformerConfig(),  # noqa: B008 - frozen
-        schedule: ScheduleConfig = ScheduleConfig(),  # noqa: B008
-        diffusion: DiffusionConfig = DiffusionConfig(),  # noqa: B008
-        optimizer: OptimizerConfig = OptimizerConfig(),  # noqa: B008
-        draws: int = 1,
-        beta: float = 100.0,
-        weight: float = 1.0,
-        pairs: int = 32,
+        self, preferences: str, *, beta: float = 100.0, weight: float = 1.0, pairs: int = 32, **ddpm: Any
     ) -> None:
-        super().__init__(denoiser, schedule, diffusion, optimizer, draws)
+        super().__init__(**ddpm)
         self.path = preferences
         self.preferences: Preferences
         self.beta, self.weight, self.pairs = beta, weight, pairs
@@ -63,13 +47,13 @@ class VerdictTuning(DDPM):
         self._loaded: dict[str, Tensor] | None = None
 
     def setup(self, stage: str) -> None:
-        """Read the pairs, too."""
+        """Read the pairs too."""
         super().setup(stage)
         if stage == "fit":
             self.preferences = Preferences.load(self.path)
 
     def on_fit_start(self) -> None:
-        """Keep a copy of the network as it begins, or as it began."""
+        """Keep a copy of the network as it is at the beginning, or was before a resume."""
         self._frozen = [copy.deepcopy(self.model).requires_grad_(False).eval()]
         if self._loaded is not None:
             self._frozen[0].load_state_dict(self._loaded)

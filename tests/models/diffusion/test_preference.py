@@ -107,7 +107,10 @@ def test_a_foreign_file_is_named_in_one_line(content: bytes | None, compact: Pat
 def module_for(path: Path, **options: Any) -> VerdictTuning:
     pl.seed_everything(0, verbose=False)
     return VerdictTuning(
-        str(path), TINY_CROSS, optimizer=OptimizerConfig(learning_rate=3e-3, warmup=1), **{"pairs": 16, **options}
+        str(path),
+        denoiser=TINY_CROSS,
+        optimizer=OptimizerConfig(learning_rate=3e-3, warmup=1),
+        **{"pairs": 16, **options},
     )
 
 
