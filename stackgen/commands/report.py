@@ -2,50 +2,47 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
-from stackgen.commands.parsing import Command
-from stackgen.commands.progress_bar import progress_bar
-from stackgen.data.shards import manifest_sha256
+from stackgen.commands.asking import arguments_of
+from stackgen.commands.parsing import CONFIG_FLAGS, Command, option_values
+from stackgen.commands.progress_bar import Advance, progress_bar
 from stackgen.errors import StackgenError
-from stackgen.evaluation.protocol import ParallelChecker, load_scenes, physics_of
+from stackgen.evaluation.parallel import simulating
+from stackgen.evaluation.protocol import Scene, evaluate, load_scenes, physics_of
 from stackgen.evaluation.report.charts import draw_charts
-from stackgen.evaluation.report.collect import Asked, Store, Task, answer, write_record
-from stackgen.evaluation.report.figures import Result, results_of
-from stackgen.evaluation.report.known import Ceiling, Unseen, read_ceiling, read_unseen
-from stackgen.evaluation.report.plan import Plan, ReportSettings, machine, make_plan
-from stackgen.evaluation.report.rows import LIST_NAMES, Line, Row, check_rows, run_seconds, trainings
+from stackgen.evaluation.report.references import DiversityLimit, Unseen, read_diversity_limit, read_unseen
+from stackgen.evaluation.report.results import Result, result_of, run_seconds
+from stackgen.evaluation.report.rows import LIST_NAMES, ReportSettings, check_rows, trainings
 from stackgen.evaluation.report.sheets import draw_sheets
-from stackgen.evaluation.report.tables import World, terminal_table, to_csv, to_json, to_markdown
-from stackgen.evaluation.results import Evaluation
-from stackgen.io.files import write_atomically
-from stackgen.io.provenance import code_version
+from stackgen.evaluation.report.store import Store
+from stackgen.evaluation.report.tables import Conditions, csv_rows, terminal_table, to_json, to_markdown
+from stackgen.evaluation.report.tasks import Task, tasks_of
+from stackgen.evaluation.results import Evaluation, write_csv
+from stackgen.io.files import write_atomically, write_json
+from stackgen.io.provenance import code_version, machine
 from stackgen.protocols import StabilityChecker
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
 from stackgen.training.runs import RUNS
-from stackgen.world import Catalogue, Grid
+from stackgen.world import World
 
-RESULTS = Path("docs/results")
-CACHE = RUNS / ".report"
+ROWS = Path(__file__).parents[1] / "assets" / "report.yaml"
+"""The paper's table, where no other rows are given."""
 
 
 def main(
     settings: ReportSettings,
-    out: Path = RESULTS,
+    out: Path = Path("out/report"),
     limit: int | None = None,
     workers: int | None = None,
-    cache: Path = CACHE,
+    cache: Path = RUNS / ".report",
     runs: Path = RUNS,
 ) -> None:
     """Make the paper's table with every row: collect what has been tested, run what is missing, write it down.
@@ -56,211 +53,137 @@ def main(
     Args:
         settings: What to report.
         out: Folder for `table.md`, `.csv`, `.json`, the charts and the contact sheets.
-        limit: Only the first so many scenes, to try things out; give another `out` then.
+        limit: Number of scenes to ask about, from the first, to try things out; all by default.
         workers: Processes that simulate; by default one for each core.
-        cache: Folder in which answers are kept.
+        cache: Folder in which results are kept.
         runs: Folder in which `stackgen test` left its runs.
     """
     began, console = time.perf_counter(), Console()
     check_rows(settings.rows)
-    workers = _checked_workers(workers)
-    if limit is not None and (limit < 1 or out == RESULTS):
-        raise StackgenError(f"report: limit must be at least 1, and out another folder than {RESULTS}: it is a trial")
-    everything, manifest = load_scenes(settings.test_set)
-    asked = Asked(everything[:limit], settings.num_samples, settings.seed, grid=Grid(**manifest["grid"]))
-    with _checker(manifest, workers) as checker:
-        world = _world(settings, asked, manifest, len(everything), physics_of(checker))
-        lines = gather(settings, asked, world, manifest, checker, Store(cache, runs), console)
-        unseen = _unseen(settings, world, console)
-        results = results_of(_told(lines, unseen), _ceiling(settings, world, console), unseen)
-        write_report(results, settings, world, unseen, asked, _simulator(manifest, until_fall=False), out)
+    if (limit is not None and limit < 1) or (workers is not None and workers < 1):
+        raise StackgenError("report: limit and workers must be at least 1")
+    everything, dataset = load_scenes(settings.test_set)
+    scenes, manifest, world = everything[:limit], dataset.manifest, dataset.world
+    physics = Physics.recorded(manifest.physics)
+    with simulating(physics, workers or os.cpu_count() or 1) as checker:
+        conditions = Conditions(
+            (manifest.name, manifest.sha256),
+            len(scenes),
+            len(everything),
+            settings.num_samples,
+            settings.seed,
+            physics_of(checker),
+            code_version(),
+            machine(),
+        )
+        test_set = {"name": manifest.name, "sha256": manifest.sha256}
+        facts = {"code": conditions.code, "machine": conditions.machine, "dataset": test_set}
+        tasks = tasks_of(settings, manifest, len(scenes), conditions.physics, facts)
+        answers = gather(tasks, scenes, checker, Store(cache, runs), console)
+    limits, unseen = _references(settings, conditions, console)
+    results = [result_of(task.row, answers[task.place], task.question, limits, unseen) for task in tasks]
+    whole = SimulatorChecker(physics)  # for the pictures: what falls, falls to the end
+    write_report(results, settings, conditions, unseen, scenes, world, whole, out)
     console.print(terminal_table(results))
     console.print(f"wrote {out}/table.md, .csv, .json and the pictures beside it", highlight=False)
     _tell_costs(results, settings, time.perf_counter() - began, console)
 
 
-def _checked_workers(workers: int | None) -> int:
-    if workers is not None and workers < 1:
-        raise StackgenError(f"report: workers must be at least 1, got {workers}")
-    return workers or os.cpu_count() or 1
-
-
-@contextmanager
-def _checker(manifest: Mapping[str, Any], workers: int) -> Iterator[StabilityChecker]:
-    """PyBullet in the test set's world, on so many processes; a rollout ends at the first fall."""
-    factory = partial(_simulator, manifest, until_fall=True)
-    if workers == 1:
-        yield factory()
-        return
-    with ParallelChecker(factory, workers) as checker:
-        yield checker
-
-
-def _simulator(manifest: Mapping[str, Any], until_fall: bool) -> SimulatorChecker:
-    catalogue, physics = Catalogue.from_json(manifest["catalogue"]), Physics.of_world(manifest.get("physics"))
-    return SimulatorChecker(physics, catalogue, until_fall)
-
-
-def _world(
-    settings: ReportSettings, asked: Asked, manifest: dict[str, Any], number: int, physics: dict[str, Any] | None
-) -> World:
-    """What all figures hold for."""
-    return World(
-        (str(manifest["name"]), manifest_sha256(manifest)),
-        len(asked.scenes),
-        number,
-        settings.num_samples,
-        settings.seed,
-        physics,
-        code_version(),
-        machine(),
-    )
-
-
 def gather(
-    settings: ReportSettings,
-    asked: Asked,
-    world: World,
-    manifest: Mapping[str, Any],
-    checker: StabilityChecker,
-    store: Store,
-    console: Console,
-) -> list[Line]:
-    """The lines of all rows; what is missing is run, and kept at once.
-
-    Raises:
-        StackgenError: If a row has neither weights nor a record.
-    """
-    facts = {
-        "code": world.code,
-        "machine": world.machine,
-        "dataset": dict(zip(("name", "sha256"), world.test_set, strict=True)),
-    }
-    plan = make_plan(settings, asked, facts, manifest, world.physics)
-    everything = [task for row in settings.rows for task in plan.tasks.get(row.name, ())]
-    found = {_place(task): store.find(task.question) for task in everything}
-    _tell_plan(settings.rows, plan, found, store, console)
-    missing = [task for task in everything if found[_place(task)] is None]
-    answers = {place: pair[0] for place, pair in found.items() if pair}
-    answers |= _run(missing, asked, checker, store)
-    lines: list[Line] = []
-    for row in settings.rows:
-        if row.name not in plan.tasks:
-            lines += plan.record_of(row, asked, world.test_set[1], world.physics)
-            continue
-        own = [Line(row, answers[_place(task)], task.question) for task in plan.tasks[row.name]]
-        if row.recorded is not None and world.scenes == world.all_scenes:
-            write_record(own)
-        lines += own
-    return lines
+    tasks: Sequence[Task], scenes: Sequence[Scene], checker: StabilityChecker, store: Store, console: Console
+) -> dict[tuple[str, str], Evaluation]:
+    """Find the answers that are kept, run what is missing, and keep that at once."""
+    answers: dict[tuple[str, str], Evaluation] = {}
+    for task in tasks:
+        found = store.find(task.question)
+        if found:
+            answers[task.place] = found[0]
+        state = f"kept in {found[1]}" if found else "to be run"
+        console.print(f"{_title(task)}: {state}", highlight=False)
+        for path, remark in store.left_out(task.question):
+            console.print(f"  left out {path}: {remark}", style="yellow", highlight=False)
+    missing = [task for task in tasks if task.place not in answers]
+    return answers | _run(missing, scenes, checker, store)
 
 
-def _place(task: Task) -> tuple[str, str]:
-    return task.row.name, task.block_list
+def _title(task: Task) -> str:
+    return f"{task.row.name}, {LIST_NAMES[task.request.block_list]} list"
 
 
 def _run(
-    missing: Sequence[Task], asked: Asked, checker: StabilityChecker, store: Store
+    missing: Sequence[Task], scenes: Sequence[Scene], checker: StabilityChecker, store: Store
 ) -> dict[tuple[str, str], Evaluation]:
-    """Ask what is to be asked, one after the other; each answer is kept at once."""
+    """Run one task after the other."""
     answers: dict[tuple[str, str], Evaluation] = {}
     if not missing:
         return answers
-    number = len(asked.scenes)
-    with progress_bar("scenes", len(missing) * number) as (advance, say):
+    with progress_bar("scenes", len(missing) * len(scenes)) as (advance, say):
         for task in missing:
-            before, began = len(answers) * number, time.perf_counter()
+            before, began = len(answers) * len(scenes), time.perf_counter()
             try:
-                found = answer(task, asked, checker, lambda done, _, before=before: advance(before + done))  # type: ignore[misc]
+                found = evaluate(task.request, scenes, checker, partial(_advance, advance, before))
                 store.keep(found, task.question)
             except KeyboardInterrupt:
                 done = f"{len(answers)} of {len(missing)} are done and kept"
                 raise KeyboardInterrupt(f"{done}: the same command goes on from there") from None
-            answers[_place(task)] = found
-            say(f"{task.row.name}, {LIST_NAMES[task.block_list]} list: {time.perf_counter() - began:.0f} s")
+            answers[task.place] = found
+            say(f"{_title(task)}: {time.perf_counter() - began:.0f} s")
     return answers
 
 
-def _tell_plan(
-    rows: Sequence[Row], plan: Plan, found: Mapping[tuple[str, str], Any], store: Store, console: Console
-) -> None:
-    """Say where each answer comes from, and what is not taken for one."""
-    for row in rows:
-        if row.name in plan.absent:
-            console.print(f"{row.name}: recorded in {row.recorded} ({plan.absent[row.name]})", highlight=False)
-        for task in plan.tasks.get(row.name, ()):
-            pair = found[_place(task)]
-            state = "to be run" if pair is None else f"kept in {pair[1]}"
-            console.print(f"{row.name}, {LIST_NAMES[task.block_list]} list: {state}", highlight=False)
-            for path, remark in store.left_out(task.question):
-                console.print(f"  left out {path}: {remark}", style="yellow", highlight=False)
+def _advance(advance: Advance, before: int, done: int, _: int) -> None:
+    """Move the bar of all tasks together."""
+    advance(before + done)
 
 
-def _told(lines: Sequence[Line], unseen: Unseen | None) -> list[Line]:
-    """The lines, with a remark where it is not known what training has seen."""
-    told = []
-    for line in lines:
-        trained_on = line.evaluation.facts.get("trained_on") or {}
-        if unseen is not None and trained_on and trained_on["sha256"] not in unseen.hashes:
-            remark = f"trained on {trained_on['name']}, of which it is not known what it holds of the test set"
-            line = replace(line, remarks=(*line.remarks, remark))
-        told.append(line)
-    return told
-
-
-def _ceiling(settings: ReportSettings, world: World, console: Console) -> Ceiling | None:
-    if settings.ceiling is None:
-        return None
+def _references(
+    settings: ReportSettings, conditions: Conditions, console: Console
+) -> tuple[DiversityLimit | None, Unseen | None]:
+    """Read what is known of the scenes, or say what is left out of the report."""
+    limit, unseen = None, None
     try:
-        return read_ceiling(settings.ceiling, world.test_set[1], world.physics)
+        if settings.diversity_limit is not None:
+            limit = read_diversity_limit(settings.diversity_limit, conditions.test_set[1], conditions.physics)
     except StackgenError as error:
-        console.print(f"no ceiling of valid diversity: {error}", style="yellow", highlight=False)
-        return None
-
-
-def _unseen(settings: ReportSettings, world: World, console: Console) -> Unseen | None:
+        console.print(f"no diversity limit: {error}", style="yellow", highlight=False)
     try:
-        return read_unseen(world.test_set[1], settings.training_sets)
+        unseen = read_unseen(conditions.test_set[1], settings.training_sets)
     except StackgenError as error:
-        console.print(f"no figures on unseen scenes: {error}", style="yellow", highlight=False)
-        return None
+        console.print(f"no metrics on unseen scenes: {error}", style="yellow", highlight=False)
+    return limit, unseen
 
 
 def write_report(
     results: Sequence[Result],
     settings: ReportSettings,
-    world: World,
+    conditions: Conditions,
     unseen: Unseen | None,
-    asked: Asked,
+    scenes: Sequence[Scene],
+    world: World,
     checker: StabilityChecker,
     out: Path,
 ) -> None:
-    """Write tables and pictures; the checker judges the samples that are drawn once more.
+    """Write tables and pictures; the checker is asked once more about the samples that are drawn.
 
     Raises:
         StackgenError: If one cannot be written.
     """
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StackgenError(f"{out}: no folder to write to: {error.strerror}") from error
-    pictures = draw_charts(results, out)
-    scenes = {scene.name: scene for scene in asked.scenes}
-    pictures += draw_sheets([result.line for result in results], scenes, checker, out, asked.grid)
-    content = json.dumps(to_json(results, world, unseen, settings.groundwork), indent=1, allow_nan=False)
-    write_atomically(out / "table.json", f"{content}\n".encode())
-    write_atomically(out / "table.csv", to_csv(results).encode())
-    write_atomically(out / "table.md", to_markdown(results, world, unseen, pictures, settings.groundwork).encode())
+    by_name: Mapping[str, Scene] = {scene.name: scene for scene in scenes}
+    pictures = draw_charts(results, out) + draw_sheets(results, by_name, checker, out, world.grid)
+    write_json(out / "table.json", to_json(results, conditions, unseen, settings.groundwork))
+    write_csv(out / "table.csv", csv_rows(results))
+    text = to_markdown(results, conditions, unseen, pictures, settings.groundwork)
+    write_atomically(out / "table.md", text.encode())
 
 
 def _tell_costs(results: Sequence[Result], settings: ReportSettings, spent: float, console: Console) -> None:
-    """What this report took, what all rows would take anew, and what training them took."""
-    again = run_seconds(result.line for result in results)
+    """Say what this report took, what all rows take from their weights, and what training them took."""
+    again = run_seconds(results)
     hours = sum(training.hours for training in trainings(settings.rows, settings.groundwork))
     console.print(
-        f"This report took {spent / 60:.1f} minutes. From shipped weights, with nothing kept: {again / 60:.1f} minutes "
-        f"and the pictures. From scratch: {hours:.1f} hours of generating and training before that, as far as the rows "
-        "tell; the commands are at the end of table.md.",
+        f"This report took {spent / 60:.1f} minutes. From shipped weights, with nothing kept, it takes "
+        f"{again / 60:.1f} minutes and the pictures. From scratch, {hours:.1f} hours of generating and training come "
+        "before that; the commands are at the end of table.md.",
         highlight=False,
     )
 
@@ -269,13 +192,15 @@ COMMAND = Command(
     "report",
     main,
     """
-    stackgen report --config configs/report.yaml
-    stackgen report --config configs/report.yaml --limit 20 --out out/report
+    stackgen report
+    stackgen report --limit 20 --workers 2
+    stackgen report --config configs/report.yaml --out docs/results
     """,
-    settings=("settings", ReportSettings),
+    settings={"settings": ReportSettings},
 )
 
 
 def run(verb: str, argv: Sequence[str]) -> int | None:
-    """Run the verb."""
-    return COMMAND.run(argv)
+    """Run the verb, by default for the rows of the paper's table."""
+    given = option_values(argv, CONFIG_FLAGS)
+    return COMMAND.run(arguments_of(verb, argv if given else ["--config", str(ROWS), *argv]))

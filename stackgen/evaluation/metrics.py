@@ -1,29 +1,26 @@
-"""What a generated stack is worth: the paper's metrics, and ours beside them.
+"""What a sampled stack is worth: the paper's metrics, and ours beside them.
 
-Each metric is a pure function of one scene's scores, and a thin torchmetrics class that only adds up
-what the function says. Percentages are left to whoever prints: everything here lies in [0, 1].
+Each metric is a pure function of one scene's scores. Percentages are left to the code that prints: everything here
+lies in [0, 1].
 
 Legend: n samples a scene, S shapes, H x W pixels, B scenes, T ranked block lists a scene.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import ChainMap
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
-from torchmetrics import Metric, MetricCollection
 
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
 from stackgen.protocols import Verdict
-from stackgen.sampling.feasible import VALID_IOU, Layout, can_make, layout
+from stackgen.sampling.feasible import VALID_IOU, Layout, layout
 from stackgen.stack import Stack
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, Mask, View
+from stackgen.world import Grid, Mask, View
 
 
 @dataclass(frozen=True)
@@ -69,7 +66,7 @@ class SceneScore:
             raise StackgenError("a scene's score needs at least one sample")
 
 
-def score_sample(stack: Stack, verdict: Verdict, targets: Mapping[View, Mask], grid: Grid = PAPER_GRID) -> SampleScore:
+def score_sample(stack: Stack, verdict: Verdict, targets: Mapping[View, Mask], grid: Grid) -> SampleScore:
     """Score a generated stack.
 
     Args:
@@ -80,8 +77,8 @@ def score_sample(stack: Stack, verdict: Verdict, targets: Mapping[View, Mask], g
     """
     ious: dict[View, float] = dict.fromkeys(targets, 0.0)
     if verdict.stable:
-        ious = {view: silhouette_iou(verdict.settled, target, view, grid) for view, target in targets.items()}
-    before = silhouette_iou(stack, targets["front"], "front", grid)
+        ious = {view: silhouette_iou(verdict.settled, target, grid, view) for view, target in targets.items()}
+    before = silhouette_iou(stack, targets["front"], grid, "front")
     return SampleScore(verdict.stable, ious, before, layout(stack, grid))
 
 
@@ -138,89 +135,18 @@ SCENE_METRICS: dict[str, SceneMetric] = {
 """By the name they have in logs, tables and `metrics.json`; what is added here is measured too."""
 
 
-class _Ratio(Metric):
-    """A sum over a weight, accumulated over updates and processes; NaN while the weight is 0."""
+def view_iou(view: View) -> SceneMetric:
+    """Make the metric of one view: IoU of the settled stacks where there is a target for it; 0 if unstable."""
 
-    full_state_update = False
-    higher_is_better = True
-    total: Tensor
-    weight: Tensor
+    def metric(scene: SceneScore) -> tuple[float, float]:
+        ious = [sample.ious[view] for sample in scene.samples if view in sample.ious]
+        return float(sum(ious)), len(ious)
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("weight", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-
-    def _add(self, parts: Iterable[tuple[float, float]]) -> None:
-        for total, weight in parts:
-            self.total += total
-            self.weight += weight
-
-    def compute(self) -> Tensor:
-        """The ratio so far."""
-        return (self.total / self.weight).float()
+    return metric
 
 
-class _SceneMean(_Ratio):
-    per_scene: SceneMetric
-
-    @classmethod
-    def of(cls, per_scene: SceneMetric) -> type[_SceneMean]:
-        """The class of a metric; one that has none is made here."""
-        known = next((c for c in cls.__subclasses__() if c.per_scene is per_scene), None)
-        return known or type(per_scene.__name__, (cls,), {"per_scene": staticmethod(per_scene)})
-
-    def update(self, scenes: Sequence[SceneScore]) -> None:
-        """Add some scenes."""
-        self._add(type(self).per_scene(scene) for scene in scenes)
-
-
-class StabilityRate(_SceneMean):
-    """See :func:`stability`."""
-
-    per_scene = staticmethod(stability)
-
-
-class FrontIoU(_SceneMean):
-    """See :func:`front_iou`."""
-
-    per_scene = staticmethod(front_iou)
-
-
-class AverageIoU(_SceneMean):
-    """See :func:`average_iou`."""
-
-    per_scene = staticmethod(average_iou)
-
-
-class Diversity(_SceneMean):
-    """See :func:`diversity`."""
-
-    per_scene = staticmethod(diversity)
-
-
-class ValidDiversity(_SceneMean):
-    """See :func:`valid_diversity`."""
-
-    per_scene = staticmethod(valid_diversity)
-
-
-class IoUGivenStable(_SceneMean):
-    """See :func:`iou_given_stable`."""
-
-    per_scene = staticmethod(iou_given_stable)
-
-
-class FrontIoUBeforePhysics(_SceneMean):
-    """See :func:`front_iou_before`."""
-
-    per_scene = staticmethod(front_iou_before)
-
-
-def scene_metrics(prefix: str = "") -> MetricCollection:
-    """All metrics of generated stacks, to be updated with sequences of :class:`SceneScore`."""
-    named: dict[str, Metric | MetricCollection] = {n: _SceneMean.of(f)() for n, f in SCENE_METRICS.items()}
-    return MetricCollection(named, prefix=prefix, compute_groups=False)
+METRICS = ChainMap[str, SceneMetric]({"side_iou": view_iou("side"), "top_iou": view_iou("top")}, SCENE_METRICS)
+"""All that is measured of a scene's samples: SCENE_METRICS, and the views that the average is made of."""
 
 
 def list_rank(ranked: ArrayLike, truth: ArrayLike) -> NDArray[np.int64]:
@@ -231,29 +157,3 @@ def list_rank(ranked: ArrayLike, truth: ArrayLike) -> NDArray[np.int64]:
     """
     equal = (np.asarray(ranked) == np.asarray(truth)[:, None]).all(axis=-1)
     return np.where(equal.any(axis=1), equal.argmax(axis=1), equal.shape[1])
-
-
-class TopK(_Ratio):
-    """How often the true block list is among a predictor's first k; `k=1` is the exact match."""
-
-    def __init__(self, k: int = 1, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.k = k
-
-    def update(self, ranked: ArrayLike, truth: ArrayLike) -> None:
-        """Add B scenes: ranked lists (B, T, S) and true ones (B, S)."""
-        rank = list_rank(np.asarray(ranked)[:, : self.k], truth)
-        self._add([(float((rank < self.k).sum()), len(rank))])
-
-
-class ListFeasibility(_Ratio):
-    """How often a block list is one that can make the silhouette; see :func:`can_make`."""
-
-    def __init__(self, catalogue: Catalogue = PAPER_CATALOGUE, grid: Grid = PAPER_GRID, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.catalogue, self.grid = catalogue, grid
-
-    def update(self, counts: ArrayLike, silhouettes: ArrayLike) -> None:
-        """Add B scenes: block lists (B, S) and silhouettes (B, H, W)."""
-        pairs = zip(np.asarray(silhouettes, dtype=bool), np.asarray(counts), strict=True)
-        self._add((float(can_make(image, c, self.catalogue, self.grid)), 1) for image, c in pairs)

@@ -1,4 +1,4 @@
-"""The paper's bar charts (its Fig. 5), with both block lists, error bars and the paper's own figures."""
+"""The paper's bar charts (its Fig. 5), with both block lists, error bars and the paper's own numbers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from stackgen.evaluation.intervals import Estimate
-from stackgen.evaluation.report.figures import ALL, Result
+from stackgen.evaluation.report.results import ALL, Result
 from stackgen.evaluation.report.rows import LIST_NAMES
 from stackgen.evaluation.results import PREDICTED_LIST, TRUE_LIST
 from stackgen.io.files import write_atomically
@@ -29,8 +29,8 @@ class Chart(NamedTuple):
     """A chart with a panel for each metric, its bars by method and block list.
 
     Args:
-        file: Its name.
-        title: Says what it shows.
+        file: Name of its file.
+        title: What it shows.
         panels: Metrics and their headings.
     """
 
@@ -59,7 +59,7 @@ VIEWS_FILE = "chart-iou-views.png"
 
 
 def draw_charts(results: Sequence[Result], folder: Path) -> list[str]:
-    """Draw all charts into a folder; answers the lines of Markdown that show them.
+    """Draw all charts into a folder; answer the lines of Markdown that show them.
 
     Raises:
         StackgenError: If they cannot be written.
@@ -75,12 +75,12 @@ def draw_charts(results: Sequence[Result], folder: Path) -> list[str]:
 
 def _draw_chart(chart: Chart, results: Sequence[Result], path: Path) -> None:
     drawn = [result for result in results if any(_estimate(result, metric) for metric, _ in chart.panels)]
-    names = list(dict.fromkeys(result.line.row.name for result in drawn))
+    names = list(dict.fromkeys(result.row.name for result in drawn))
     figure, axes = _panels(len(chart.panels), len(names), chart.title)
     for panel, (metric, heading) in zip(axes, chart.panels, strict=True):
         for place, source in enumerate((TRUE_LIST, PREDICTED_LIST)):
-            some = [result for result in drawn if result.line.block_list == source]
-            x = np.array([names.index(result.line.row.name) for result in some]) + 0.38 * (place - 0.5)
+            some = [result for result in drawn if result.block_list == source]
+            x = np.array([names.index(result.row.name) for result in some]) + 0.38 * (place - 0.5)
             _bars(panel, x, [(r, metric) for r in some], 0.36, COLOURS[source], f"{LIST_NAMES[source]} list")
             quoted = [(at, r.paper[metric]) for at, r in zip(x, some, strict=True) if metric in r.paper]
             if quoted:
@@ -91,8 +91,8 @@ def _draw_chart(chart: Chart, results: Sequence[Result], path: Path) -> None:
 
 
 def _draw_views(results: Sequence[Result], path: Path) -> None:
-    """As in the paper: IoU by view, with the CNN's lists (the true stacks have no other list than theirs)."""
-    lists = {result.line.row.name: result for result in results}  # of each row the last: the CNN's where there is one
+    """Draw IoU by view as the paper does, with the CNN's lists (the true stacks have no other list than theirs)."""
+    lists = {result.row.name: result for result in results}  # the last of each row: the CNN's where there is one
     names = list(lists)
     figure, (panel,) = _panels(1, len(names), "IoU by view, the CNN's block lists")
     views = (("front_iou", "front"), ("side_iou", "side"), ("top_iou", "top"), ("avg_iou", "average"))
@@ -104,7 +104,7 @@ def _draw_views(results: Sequence[Result], path: Path) -> None:
 
 
 def _panels(number: int, methods: int, title: str) -> tuple[Figure, list[Axes]]:
-    """A figure of empty panels side by side."""
+    """Make empty panels side by side."""
     from matplotlib.figure import Figure  # without pyplot: no window, no state
 
     figure = Figure(figsize=(number * max(4.2, 1.05 * methods + 1.2), 3.9), layout="constrained")
@@ -115,7 +115,7 @@ def _panels(number: int, methods: int, title: str) -> tuple[Figure, list[Axes]]:
 def _bars(
     panel: Axes, x: np.ndarray, some: Sequence[tuple[Result, str]], width: float, colour: str, label: str
 ) -> None:
-    """Bars with their intervals, in percent; none where there is no figure."""
+    """Draw bars with their intervals, in percent; none where the metric does not exist."""
     found = [(at, _estimate(result, metric)) for at, (result, metric) in zip(x, some, strict=True)]
     known = [(at, estimate) for at, estimate in found if estimate is not None]
     if not known:
@@ -127,7 +127,7 @@ def _bars(
 
 
 def _estimate(result: Result, metric: str) -> Estimate | None:
-    return result.figures[ALL].metrics[metric]
+    return result.metrics[ALL][metric]
 
 
 def _finish(panel: Axes, names: Sequence[str], heading: str) -> None:

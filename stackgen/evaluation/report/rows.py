@@ -1,15 +1,18 @@
-"""The rows of the report, and the lines they come to: one for each row and block list."""
+"""The rows of the report: which methods are measured, and how their weights were made."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
+from stackgen.data.dataset import TESTSET
 from stackgen.errors import StackgenError
-from stackgen.evaluation.report.store import Question
-from stackgen.evaluation.results import PAPER, PREDICTED_LIST, TRUE_LIST, Evaluation
+from stackgen.evaluation.report.references import LIMIT_FILE
+from stackgen.evaluation.requests import Method
+from stackgen.evaluation.results import PREDICTED_LIST, TRUE_LIST
+from stackgen.evaluation.tables import PAPER
 
 GROUND_TRUTH = "ground-truth"
 """As `weights`: the true stacks, simulated again."""
@@ -21,13 +24,13 @@ LIST_NAMES = {TRUE_LIST: "true", PREDICTED_LIST: "CNN's"}
 
 @dataclass(frozen=True)
 class Training:
-    """How the weights of a row were made, so that others can.
+    """How the weights of a row were made, so that others can make them.
 
     Args:
-        name: Of what is made.
-        command: Command lines.
-        hours: What they took.
-        machine: Where.
+        name: Name of what is made.
+        command: Command lines that make it.
+        hours: Time that they took [h].
+        machine: Machine that they ran on.
     """
 
     name: str
@@ -38,43 +41,30 @@ class Training:
 
 @dataclass(frozen=True)
 class Row:
-    """A method, and how it is asked.
+    """One method in the table.
 
     Args:
-        name: In the tables.
-        model: Options of `stackgen test --model.*`: `weights` (a name, a file, or `ground-truth` for the true
-            stacks simulated again) and whatever else says how it samples.
-        kind: One-shot: a sample is what comes out first. Verified: it was chosen with the judge at hand;
+        name: Its name in the tables.
+        model: Options of `stackgen test` that say who samples and how; `weights: ground-truth` are the true
+            stacks, simulated again.
+        kind: One-shot: a sample is what comes out first. Verified: it was chosen with the help of a checker;
             such rows stand in a section of their own.
-        paper: The method in the paper's table whose figures stand beside.
+        paper: Method of the paper's table whose numbers stand beside.
         training: How the weights were made.
-        recorded: File the results are kept in for good, for weights too large to ship: written where the
-            weights are, read where they are not.
         note: What the reader should know.
     """
 
     name: str
-    model: dict[str, Any]
+    model: Method
     kind: Kind = "one-shot"
     paper: str | None = None
     training: Training | None = None
-    recorded: Path | None = None
     note: str = ""
-
-    @property
-    def weights(self) -> str:
-        """Name or file of the weights."""
-        return str(self.model["weights"])
 
     @property
     def is_ground_truth(self) -> bool:
         """Whether nothing is sampled."""
-        return self.weights == GROUND_TRUTH
-
-    @property
-    def block_lists(self) -> tuple[str, ...]:
-        """The block lists it is asked with."""
-        return (TRUE_LIST,) if self.is_ground_truth else (TRUE_LIST, PREDICTED_LIST)
+        return self.model.weights == GROUND_TRUTH
 
     @property
     def slug(self) -> str:
@@ -83,59 +73,53 @@ class Row:
         return "-".join(words)
 
 
+@dataclass(frozen=True)
+class ReportSettings:
+    """How the table is made.
+
+    Args:
+        rows: Methods, in their order.
+        groundwork: What comes before the rows when everything is made from scratch: data, block-list network.
+        test_set: Dataset whose test scenes are asked about.
+        num_samples: Samples of each scene.
+        seed: Seed of the samplers.
+        training_sets: Training sets whose layouts count as seen, by the names that ship with the package; null
+            takes all of them.
+        diversity_limit: File with the valid layouts of the scenes, as `python -m benchmarks.diversity_limit` writes
+            it; null leaves the diversity limit out.
+    """
+
+    rows: list[Row] = field(default_factory=list)
+    groundwork: list[Training] = field(default_factory=list)
+    test_set: Path = TESTSET
+    num_samples: int = 3
+    seed: int = 0
+    training_sets: list[str] | None = None
+    diversity_limit: Path | None = LIMIT_FILE
+
+    def __post_init__(self) -> None:
+        if self.num_samples < 1 or not 0 <= self.seed < 2**63:
+            raise StackgenError("report: num_samples must be at least 1 and seed at least 0")
+
+
 def check_rows(rows: Sequence[Row]) -> None:
-    """Raise StackgenError unless the rows can be told apart and name what exists."""
+    """See that the rows can be told apart and name what exists.
+
+    Raises:
+        StackgenError: If not.
+    """
     if not rows:
-        raise StackgenError("report: there are no rows; give --config configs/report.yaml")
+        raise StackgenError("report: there are no rows; leave --rows out for the paper's table")
     slugs = [row.slug for row in rows]
     for row in rows:
         if not row.slug or slugs.count(row.slug) > 1:
-            raise StackgenError(f"report: rows need names of their own, {row.name!r} is none")
-        if "weights" not in row.model:
-            raise StackgenError(f"report: row {row.name!r} names no weights: model: {{weights: NAME}}")
-        if (row.kind == "verified") != ("verify" in row.model):
-            raise StackgenError(
-                f"report: row {row.name!r}: verified is what has `verify` in its model, and nothing else"
-            )
+            raise StackgenError(f"report: each row needs a name of its own, {row.name!r} is none")
+        if (row.kind == "verified") != (row.model.verify is not None):
+            raise StackgenError(f"report: row {row.name!r}: a row is verified if its model has `verify`, and only then")
         if row.paper is not None and row.paper not in PAPER:
             raise StackgenError(f"report: row {row.name!r}: the paper has {', '.join(PAPER)}, not {row.paper!r}")
 
 
-@dataclass(frozen=True)
-class Line:
-    """A row with one of the block lists, answered.
-
-    Args:
-        row: Whose.
-        evaluation: The answer.
-        question: What was asked.
-        recorded: Whether the answer was read from the row's record.
-        remarks: In what the question differs from the other lines', in words.
-    """
-
-    row: Row
-    evaluation: Evaluation
-    question: Question
-    recorded: bool = False
-    remarks: tuple[str, ...] = ()
-
-    @property
-    def block_list(self) -> str:
-        """Whose block lists."""
-        return self.evaluation.block_list
-
-    @property
-    def has_diversity(self) -> bool:
-        """Whether there is more than one sample a scene to tell apart."""
-        return self.evaluation.num_samples > 1
-
-
-def run_seconds(lines: Iterable[Line]) -> float:
-    """What sampling and judging took where it was told and done here, of all lines together [s]."""
-    told = [line.evaluation.facts for line in lines if not line.recorded]
-    return float(sum(facts.get(part) or 0 for facts in told for part in ("sampling_s", "judging_s")))
-
-
-def trainings(rows: Sequence[Row], groundwork: Sequence[Training]) -> list[Training]:
-    """Everything to be done before the rows can be asked."""
+def trainings(rows: Iterable[Row], groundwork: Sequence[Training]) -> list[Training]:
+    """List everything that must be made before the rows can be asked."""
     return [*groundwork, *(row.training for row in rows if row.training)]

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from stackgen.evaluation.protocol import Scene
-from stackgen.evaluation.report.pick import Example, pick_examples
-from stackgen.evaluation.report.rows import LIST_NAMES, Line
+from stackgen.evaluation.report.results import Result
+from stackgen.evaluation.report.rows import LIST_NAMES
+from stackgen.evaluation.results import Evaluation, SceneResult
 from stackgen.io.files import write_atomically
 from stackgen.protocols import StabilityChecker
 from stackgen.viz.render import Picture, contact_sheet
-from stackgen.world import PAPER_GRID, Grid
+from stackgen.world import Grid
 
 _SHRINK = 0.6
 _GAP = 24  # [pixel], before shrinking
@@ -22,49 +24,91 @@ _HEADING = 54  # [pixel]
 _HEADINGS = (("stands and matches", (30, 130, 76)), ("falls, or misses the target", (214, 39, 40)))
 
 
+EXAMPLES = 4
+"""Successes on a sheet, and as many failures."""
+
+
+@dataclass(frozen=True)
+class Example:
+    """A sample of a scene.
+
+    Args:
+        scene: Results of the scene.
+        number: Number of the sample, from 0.
+    """
+
+    scene: SceneResult
+    number: int
+
+    @property
+    def front_iou(self) -> float:
+        """Front IoU of the structure that stood at the end."""
+        return self.scene.score.samples[self.number].front_iou
+
+
+def pick_examples(evaluation: Evaluation, number: int = EXAMPLES) -> tuple[list[Example], list[Example]]:
+    """Pick successes and failures of a method, neither the best nor the worst: spread evenly over the scenes.
+
+    A success is valid: it stands and matches; everything else is a failure. At most one of each kind is
+    taken from a scene.
+    """
+    found: tuple[list[Example], list[Example]] = ([], [])
+    for scene in evaluation.scenes:
+        valid = [sample.valid for sample in scene.score.samples]
+        for kind, wanted in enumerate((True, False)):
+            if wanted in valid:
+                found[kind].append(Example(scene, valid.index(wanted)))
+    return _spread(found[0], number), _spread(found[1], number)
+
+
+def _spread(examples: Sequence[Example], number: int) -> list[Example]:
+    """Take some examples, evenly spaced."""
+    places = np.linspace(0, len(examples) - 1, min(number, len(examples))).round().astype(int)
+    return [examples[place] for place in places]
+
+
 def draw_sheets(
-    lines: Sequence[Line], scenes: Mapping[str, Scene], checker: StabilityChecker, folder: Path, grid: Grid = PAPER_GRID
+    results: Sequence[Result], scenes: Mapping[str, Scene], checker: StabilityChecker, folder: Path, grid: Grid
 ) -> list[str]:
-    """A picture for each row, of its last block list; answers the lines of Markdown that show them.
+    """Draw a picture for each row, of its last block list; answer the lines of Markdown that show them.
 
     The samples shown are simulated once more, to the end, to say how far what fell did fall.
 
     Args:
-        lines: Answers.
-        scenes: By name.
-        checker: Judges the samples shown.
+        results: Results of the rows.
+        scenes: Scenes by name.
+        checker: Says of the samples shown which blocks fall.
         folder: Where the pictures go.
-        grid: Of targets and stacks.
+        grid: Scale of the targets.
 
     Raises:
         StackgenError: If a picture cannot be written.
     """
     shown = []
-    for line in {line.row.name: line for line in lines}.values():
-        successes, failures = pick_examples(line.evaluation)
-        columns = [[example for example in some if example.scene.stacks and example.scene.name in scenes]
-                   for some in (successes, failures)]  # fmt: skip
+    for result in {result.row.name: result for result in results}.values():
+        columns = [[_panel(example, scenes, checker, grid) for example in some]
+                   for some in pick_examples(result.evaluation)]  # fmt: skip
         if not any(columns):
             continue
-        picture = _sheet(*([_panel(example, scenes, checker, grid) for example in column] for column in columns))
-        name = f"sheet-{line.row.slug}.png"
-        _save(picture, folder / name)
+        name = f"sheet-{result.row.slug}.png"
+        _save(_sheet(*columns), folder / name)
         shown.append(
-            f"**{line.row.name}**, {LIST_NAMES[line.block_list]} block lists; samples spread evenly over the scenes, "
-            f"drawn as they were sampled, what then fell in red:\n\n![{line.row.name}]({name})"
+            f"**{result.row.name}**, {LIST_NAMES[result.block_list]} block lists; samples spread evenly over the "
+            "scenes, drawn as they were sampled, with the blocks that then fell in red:"
+            f"\n\n![{result.row.name}]({name})"
         )
     return shown
 
 
 def _panel(example: Example, scenes: Mapping[str, Scene], checker: StabilityChecker, grid: Grid) -> Picture:
-    """Target and sample, with what became of it."""
+    """Draw target and sample, with what became of it."""
     stack = example.scene.stacks[example.number]
     target = scenes[example.scene.name].silhouette
     return contact_sheet(target, [stack], [checker.check(stack)], [example.front_iou], grid=grid)
 
 
 def _sheet(successes: Sequence[Picture], failures: Sequence[Picture]) -> Picture:
-    """Successes at the left, failures at the right, under their headings."""
+    """Put successes at the left and failures at the right, under their headings."""
     from PIL import Image, ImageDraw, ImageFont
 
     height, width = (successes or failures)[0].shape[:2]

@@ -1,83 +1,108 @@
-"""Evaluations as files: what `stackgen test` leaves behind, what the report keeps, what is recorded for good.
+"""Where the report keeps and finds answers, by the question they answer.
 
-A file holds everything that the tables, intervals and pictures are made from, down to the sample, and the
-**question** it answers: all that the answer depends on, as plain data. Equal questions have equal keys.
+It looks in its own cache, then among the files that `stackgen test` left in the folder of runs. What answers another
+question, be it only with other physics, is never taken.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from stackgen.errors import StackgenError, warn
+from stackgen.evaluation.results import Evaluation, Question, read_evaluation, write_evaluation
 
-from stackgen.errors import StackgenError
-from stackgen.evaluation.metrics import SampleScore, SceneScore
-from stackgen.evaluation.results import Evaluation, SceneResult
-from stackgen.io.files import write_atomically
-from stackgen.stack import Stack
-from stackgen.world import PAPER_CATALOGUE, Catalogue
-
-FORMAT = "stackgen.evaluation/1"
 PREFIX = "evaluation-"
-"""How the names of such files begin."""
+"""How the names of the files begin."""
 
-PROTOCOL = 1
-"""To be raised whenever the same question is answered differently: what was kept is then asked again."""
-
-Question = dict[str, Any]
+_CONDITIONS = ("physics", "test_set", "protocol")
+"""Parts of a question: where they differ, results cannot be compared."""
 
 
-def question_of(
-    sampler: Mapping[str, Any],
-    block_list: str,
-    predictor: str | None,
-    *,
-    test_set: str,
-    scenes: int,
-    num_samples: int,
-    seed: int,
-    batch_size: int,
-    physics: Mapping[str, Any] | None,
-) -> Question:
-    """All that an evaluation depends on.
+class Store:
+    """Answers that are kept.
 
     Args:
-        sampler: Of what is measured: the hash of its weights and its settings.
-        block_list: `ground truth` or `predicted`.
-        predictor: Hash of the weights that predict the lists; None where they are given.
-        test_set: Hash of the manifest.
-        scenes: How many of its scenes, from the first.
-        num_samples: A scene.
-        seed, batch_size: Which samples of all that there could be.
-        physics: Of the verdicts.
+        cache: Folder of the report's own; made when it is needed.
+        runs: Folder in which `stackgen test` left its runs.
     """
-    plain = {
-        "protocol": PROTOCOL,
-        "sampler": sampler,
-        "block_list": block_list,
-        "predictor": predictor,
-        "test_set": test_set,
-        "scenes": scenes,
-        "num_samples": num_samples,
-        "seed": seed,
-        "batch_size": batch_size,
-        "physics": physics,
-    }
-    return json.loads(json.dumps(plain, sort_keys=True))  # as it will be read back
+
+    def __init__(self, cache: Path, runs: Path) -> None:
+        self.cache, self.runs = cache, runs
+
+    def find(self, question: Question) -> tuple[Evaluation, Path] | None:
+        """Find the answer to a question and its file, if there is one."""
+        own = self._path(question)
+        paths = [*([own] if own.exists() else []), *(p for p, asked in self._tests.items() if asked == question)]
+        for path in paths:
+            try:
+                evaluation, answered = read_evaluation(path)
+            except StackgenError as error:
+                warn(str(error))
+                continue
+            if answered == question:
+                return evaluation, path
+        return None
+
+    def left_out(self, question: Question) -> Iterator[tuple[Path, str]]:
+        """Name tests of the same sampler under other conditions, and in what those differ."""
+        for path, asked in self._tests.items():
+            same = all(asked.get(part) == question[part] for part in ("sampler", "block_list"))
+            if same and (remarks := other_conditions(question, asked)):
+                yield path, "; ".join(remarks)
+
+    def keep(self, evaluation: Evaluation, question: Question) -> None:
+        """Put an answer into the cache.
+
+        Raises:
+            StackgenError: If it cannot be written.
+        """
+        write_evaluation(self._path(question), evaluation, question)
+
+    def _path(self, question: Question) -> Path:
+        return self.cache / f"{PREFIX}{key_of(question)}.json"
+
+    @cached_property
+    def _tests(self) -> dict[Path, Question]:
+        """What each test was asked."""
+        found = {}
+        for path in sorted(self.runs.glob(f"*/test_*/{PREFIX}*.json")):
+            try:
+                found[path] = read_evaluation(path)[1]
+            except StackgenError:
+                continue  # a test of an older version, or one that was interrupted
+        return found
 
 
 def key_of(question: Question) -> str:
-    """Short name of a question, from its content."""
+    """Give the short name of a question, from its content."""
     text = json.dumps(question, sort_keys=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
+def other_conditions(question: Question, other: Question) -> tuple[str, ...]:
+    """Say under what other conditions another question was answered; empty if they are the same.
+
+    >>> other_conditions({"physics": {"friction": 0.5}}, {"physics": {"friction": 0.4}})
+    ('other physics: friction 0.4, not 0.5',)
+    """
+    apart = differences(*({part: q.get(part) for part in _CONDITIONS} for q in (question, other)))
+    physics = [f"{path.removeprefix('physics.')} {theirs}, not {ours}"
+               for path, (ours, theirs) in apart.items() if path.startswith("physics")]  # fmt: skip
+    remarks = [f"other physics: {', '.join(physics)}"] if physics else []
+    if "test_set" in apart:
+        remarks.append(f"another test set: {str(apart['test_set'][1])[:12]}")
+    if "protocol" in apart:
+        remarks.append(f"another version of the protocol: {apart['protocol'][1]}")
+    return tuple(remarks)
+
+
 def differences(question: Question, other: Question) -> dict[str, tuple[Any, Any]]:
-    """Where two questions differ: the path of each value, with both.
+    """Find where two questions differ: the path of each value, with both.
 
     >>> differences({"seed": 0, "physics": {"friction": 0.5}}, {"seed": 0, "physics": {"friction": 0.4}})
     {'physics.friction': (0.5, 0.4)}
@@ -90,98 +115,3 @@ def differences(question: Question, other: Question) -> dict[str, tuple[Any, Any
         elif a != b:
             found[name] = (a, b)
     return found
-
-
-def write_evaluation(path: Path, evaluation: Evaluation, question: Question) -> None:
-    """Write an evaluation with the question it answers.
-
-    Raises:
-        StackgenError: If it cannot be written.
-    """
-    write_atomically(path, (json.dumps(to_json(evaluation, question), allow_nan=False) + "\n").encode())
-
-
-def read_evaluation(path: Path) -> tuple[Evaluation, Question]:
-    """Inverse of :func:`write_evaluation`.
-
-    Raises:
-        StackgenError: If the file is missing, damaged or something else.
-    """
-    try:
-        return from_json(json.loads(path.read_text()))
-    except OSError as error:
-        raise StackgenError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (ValueError, StackgenError) as error:
-        raise StackgenError(f"{path} is damaged or no evaluation: remove it") from error
-
-
-def to_json(evaluation: Evaluation, question: Question) -> dict[str, Any]:
-    """Plain form."""
-    catalogue = next((s.catalogue for scene in evaluation.scenes for s in scene.stacks), PAPER_CATALOGUE)
-    return {
-        "format": FORMAT,
-        "question": question,
-        "method": evaluation.method,
-        "block_list": evaluation.block_list,
-        "num_samples": evaluation.num_samples,
-        "seed": evaluation.seed,
-        "physics": evaluation.physics,
-        "facts": evaluation.facts,
-        "catalogue": catalogue.to_json(),
-        "scenes": [_scene_to_json(scene) for scene in evaluation.scenes],
-    }
-
-
-def from_json(data: Any) -> tuple[Evaluation, Question]:
-    """Inverse of :func:`to_json`.
-
-    Raises:
-        StackgenError: If it is not such a plain form.
-    """
-    try:
-        if data["format"] != FORMAT:
-            raise ValueError(data["format"])
-        catalogue = Catalogue.from_json(data["catalogue"])
-        scenes = tuple(_scene_from_json(scene, catalogue) for scene in data["scenes"])
-        named = {name: data[name] for name in ("method", "block_list", "num_samples", "seed", "physics", "facts")}
-        if not scenes or not isinstance(data["question"], dict):
-            raise ValueError("empty")
-        return Evaluation(scenes=scenes, **named), data["question"]
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        raise StackgenError(f"no {FORMAT} file: {error!r}") from error
-
-
-def _scene_to_json(scene: SceneResult) -> dict[str, Any]:
-    samples = scene.score.samples
-    return {
-        "name": scene.name,
-        "counts": scene.counts,
-        "stable": [sample.stable for sample in samples],
-        "ious": [dict(sample.ious) for sample in samples],
-        "front_iou_before": [sample.front_iou_before for sample in samples],
-        "layouts": [sample.layout for sample in samples],
-        "fell": scene.fell,
-        "drop": scene.drop,
-        "list_rank": scene.list_rank,
-        "feasible": scene.feasible,
-        "seconds": scene.seconds,
-        "shapes": [stack.shapes.tolist() for stack in scene.stacks],
-        "poses": [stack.poses.tolist() for stack in scene.stacks],
-    }
-
-
-def _scene_from_json(data: Mapping[str, Any], catalogue: Catalogue) -> SceneResult:
-    layouts = [tuple(tuple(row) for row in layout) for layout in data["layouts"]]
-    columns = zip(data["stable"], data["ious"], data["front_iou_before"], layouts, strict=True)
-    pairs = zip(data["shapes"], data["poses"], strict=True)
-    return SceneResult(
-        str(data["name"]),
-        tuple(data["counts"]),
-        SceneScore(tuple(SampleScore(*column) for column in columns)),
-        tuple(tuple(blocks) for blocks in data["fell"]),
-        tuple(data["drop"]),
-        data["list_rank"],
-        data["feasible"],
-        data["seconds"],
-        tuple(Stack(np.array(shapes, dtype=np.int64), np.array(poses), catalogue) for shapes, poses in pairs),
-    )

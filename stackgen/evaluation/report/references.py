@@ -1,4 +1,7 @@
-"""What is known of the test scenes beforehand: how diverse answers can be, and which of them training has seen."""
+"""What is known of the test scenes beforehand: how diverse samples can be, and which scenes training has seen.
+
+Both files ship with the package, so that neither the search nor the training sets are needed.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,12 @@ from stackgen.errors import StackgenError
 from stackgen.evaluation.diversity_limit import expected_diversity
 from stackgen.evaluation.intervals import Estimate, clustered_ratio
 from stackgen.evaluation.metrics import valid_diversity
-from stackgen.evaluation.results import Evaluation, SceneResult
+from stackgen.evaluation.results import Evaluation
 from stackgen.sampling.feasible import Layout
 
-SEEN_FILE = Path(__file__).parents[2] / "assets" / "testset-v1-unseen.json"
+_ASSETS = Path(__file__).parents[2] / "assets"
+LIMIT_FILE = _ASSETS / "testset-v1-diversity-limit.json"
+SEEN_FILE = _ASSETS / "testset-v1-unseen.json"
 SEEN_FORMAT = "stackgen.unseen/1"
 NOTIONS = {
     "designs": "no training stack has the same shapes in the same cells, nor their mirror image",
@@ -25,63 +30,64 @@ NOTIONS = {
 
 
 @dataclass(frozen=True)
-class Ceiling:
-    """The valid layouts of each scene with some block list, see benchmarks.diversity_ceiling.
+class DiversityLimit:
+    """The valid layouts of each scene with some block list, as benchmarks.diversity_limit finds them.
 
     Args:
-        layouts: By scene and block list, all that stand and match.
+        layouts: By scene and block list, all layouts that stand and match.
     """
 
     layouts: Mapping[tuple[str, tuple[int, ...]], frozenset[Layout]]
 
-    def share(self, evaluation: Evaluation) -> tuple[int, Estimate, Estimate] | None:
-        """On the scenes that both know: their number, the ceiling at so many samples, and the share of it reached."""
-        known = self._known(evaluation)
+    def estimates(self, evaluation: Evaluation) -> tuple[int, dict[str, Estimate | None]]:
+        """Compare an evaluation with the limit, on the scenes that both know.
+
+        Returns:
+            The number of those scenes, and three estimates: the limit itself at so many samples a scene
+            (`diversity_limit`), the share of it that was reached (`of_diversity_limit`), and the share of valid
+            samples whose layout was not enumerated, since they match only roughly (`beyond_diversity_limit`).
+        """
+        known = [scene for scene in evaluation.scenes if (scene.name, scene.counts) in self.layouts]
+        if not known:
+            return 0, {}
+        layouts = [self.layouts[scene.name, scene.counts] for scene in known]
         reached = [valid_diversity(scene.score)[0] for scene in known]
-        most = [expected_diversity(len(self._of(scene)), evaluation.num_samples) for scene in known]
-        whole, part = clustered_ratio(most, [1.0] * len(most)), clustered_ratio(reached, most)
-        return None if whole is None or part is None else (len(known), whole, part)
-
-    def outside(self, evaluation: Evaluation) -> Estimate | None:
-        """Share of the valid samples whose layout was not enumerated: those that match only roughly."""
-        known = self._known(evaluation)
+        most = [expected_diversity(len(some), evaluation.num_samples) for some in layouts]
         valid = [[sample.layout for sample in scene.score.samples if sample.valid] for scene in known]
-        missing = [sum(layout not in self._of(scene) for layout in some)
-                   for scene, some in zip(known, valid, strict=True)]  # fmt: skip
-        return clustered_ratio(missing, [len(some) for some in valid]) if known else None
-
-    def _known(self, evaluation: Evaluation) -> list[SceneResult]:
-        return [scene for scene in evaluation.scenes if (scene.name, scene.counts) in self.layouts]
-
-    def _of(self, scene: SceneResult) -> frozenset[Layout]:
-        return self.layouts[scene.name, scene.counts]
+        beyond = [sum(layout not in some for layout in found) for found, some in zip(valid, layouts, strict=True)]
+        estimates = {
+            "diversity_limit": clustered_ratio(most, [1.0] * len(most)),
+            "of_diversity_limit": clustered_ratio(reached, most),
+            "beyond_diversity_limit": clustered_ratio(beyond, [len(found) for found in valid]),
+        }
+        return len(known), estimates
 
 
-def read_ceiling(path: Path, test_set: str, physics: Mapping[str, Any] | None) -> Ceiling:
-    """The file that `python -m benchmarks.diversity_ceiling` writes.
+def read_diversity_limit(path: Path, test_set: str, physics: Mapping[str, Any]) -> DiversityLimit:
+    """Read the file that `python -m benchmarks.diversity_limit` writes.
 
     Raises:
         StackgenError: If it is missing, damaged, or about another test set or other physics.
     """
-    how = "make it by `python -m benchmarks.diversity_ceiling`"
+    how = "`python -m benchmarks.diversity_limit` makes it"
     try:
-        figures = json.loads(path.read_text())["figures"]
-        if figures["test_set"] != test_set or figures["physics"] != physics:
+        content = json.loads(path.read_text())["figures"]
+        if content["test_set"] != test_set or content["physics"] != physics:
             raise StackgenError(f"{path} is about another test set or other physics; {how}")
         layouts = {
             (str(scene["scene"]), tuple(scene["counts"])): frozenset(map(parse_layout, scene["valid"]))
-            for part in figures["lists"].values()
+            for part in content["lists"].values()
             for scene in part["scenes"]
         }
     except OSError as error:
         raise StackgenError(f"{path} cannot be read: {error.strerror or error}; {how}") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise StackgenError(f"{path} is damaged or another file; {how}") from error
-    return Ceiling(layouts)
+    return DiversityLimit(layouts)
 
 
 def format_layout(layout: Layout) -> str:
-    """A layout as text, the bottom layer first.
+    """Write a layout as text, the bottom layer first.
 
     >>> format_layout(((0, 1), (2,), (), ()))
     '0 1/2//'
@@ -90,7 +96,7 @@ def format_layout(layout: Layout) -> str:
 
 
 def parse_layout(text: str) -> Layout:
-    """Inverse of :func:`format_layout`."""
+    """Invert :func:`format_layout`."""
     return tuple(tuple(map(int, row.split())) for row in text.split("/"))
 
 
@@ -99,9 +105,9 @@ class Unseen:
     """Test scenes that none of some training sets holds.
 
     Args:
-        names: Of the training sets.
-        hashes: Of their manifests.
-        scenes: By notion (:data:`NOTIONS`), the names of the scenes.
+        names: Names of the training sets.
+        hashes: Hashes of their manifests.
+        scenes: By notion (see NOTIONS), the names of the scenes.
     """
 
     names: tuple[str, ...]
@@ -110,17 +116,17 @@ class Unseen:
 
 
 def read_unseen(test_set: str, training_sets: Sequence[str] | None = None, path: Path = SEEN_FILE) -> Unseen:
-    """Which test scenes training has not seen.
+    """Read which test scenes training has not seen.
 
     Args:
         test_set: Hash of the test set's manifest.
-        training_sets: Names of those to be held against it; all that the file knows by default.
-        path: That `python -m benchmarks.unseen_layouts` writes.
+        training_sets: Names of the training sets to compare it with; all that the file knows by default.
+        path: File that `python -m benchmarks.unseen_layouts` writes.
 
     Raises:
         StackgenError: If the file is missing, damaged, about another test set, or knows no such training set.
     """
-    how = "make it by `python -m benchmarks.unseen_layouts`"
+    how = "`python -m benchmarks.unseen_layouts` makes it"
     try:
         data = json.loads(path.read_text())
         if data["format"] != SEEN_FORMAT or data["test_set"] != test_set:

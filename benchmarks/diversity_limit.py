@@ -21,19 +21,20 @@ from rich.progress import track
 
 from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.data.generation.deconstruction import surely_falls
-from stackgen.data.generation.generate import TESTSET
-from stackgen.data.shards import manifest_sha256
+from stackgen.data.dataset import TESTSET
 from stackgen.errors import StackgenError
 from stackgen.evaluation.diversity_limit import PLACEMENTS, Answers, answers, expected_diversity
 from stackgen.evaluation.intervals import Estimate, clustered_ratio
 from stackgen.evaluation.protocol import Scene, load_scenes
 from stackgen.evaluation.report.known import format_layout
 from stackgen.evaluation.results import PREDICTED_LIST, TRUE_LIST
-from stackgen.models.weights import load_predictor, resolve_weights
+from stackgen.models.weights import resolve_weights
 from stackgen.protocols import Verdict
 from stackgen.sampling.feasible import layout
+from stackgen.sampling.methods import load_predictor
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.stack import Stack
+from stackgen.world import PAPER_GRID
 
 SAMPLES = 3
 """Of the protocol."""
@@ -63,7 +64,7 @@ def main() -> None:
     predicted = predictor.predict(np.stack([scene.silhouette for scene in scenes]), top=1)[:, 0]
     lists = {TRUE_LIST: [scene.counts for scene in scenes], PREDICTED_LIST: list(predicted)}
     figures: dict[str, Any] = {
-        "test_set": manifest_sha256(manifest),
+        "test_set": manifest.sha256,
         "physics": StaticsFirst().physics.to_json(),
         "samples": SAMPLES,
         "placements": options.placements,
@@ -117,7 +118,7 @@ def summary(scenes: Sequence[Scene], counts: Sequence[Counts], found: Sequence[A
     """What was found with one kind of block list."""
     ones = np.ones(len(found))
     valid = np.array([len(some.valid) for some in found])
-    own = [(layout(scene.truth), some) for scene, list_, some in zip(scenes, counts, found, strict=True)
+    own = [(layout(scene.truth, PAPER_GRID), some) for scene, list_, some in zip(scenes, counts, found, strict=True)
            if scene.truth is not None and np.array_equal(list_, scene.counts)]  # fmt: skip
     shares = {
         "ceiling": clustered_ratio([expected_diversity(number, SAMPLES) for number in valid], ones),

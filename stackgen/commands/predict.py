@@ -1,0 +1,97 @@
+"""stackgen predict: stacks for the scenes of a dataset, as files."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from stackgen.commands.asking import arguments_of, load_both, open_run
+from stackgen.commands.parsing import Command
+from stackgen.commands.progress_bar import progress_bar
+from stackgen.data.manifest import Split
+from stackgen.errors import StackgenError
+from stackgen.evaluation.protocol import BATCH, batch_seed
+from stackgen.evaluation.requests import Method
+from stackgen.io.stacks_file import StackEntry, StacksFile, write_stacks
+from stackgen.training.runs import RUNS
+
+
+def main(
+    subject: Method,
+    config: str,
+    ckpt_path: Path | None = None,
+    test_set: str | None = None,
+    split: Split = "test",
+    num_samples: int = 3,
+    seed: int = 0,
+    predicted_lists: bool = False,
+    limit: int | None = None,
+    batch_size: int = BATCH,
+    name: str = "run",
+    runs: Path = RUNS,
+) -> None:
+    """Sample stacks for every scene of a dataset's split, and write a stacks file for each.
+
+    The stacks are those that `stackgen test` measures with the same options. The files and the configuration go to
+    runs/NAME/predict_N.
+
+    Args:
+        subject: Who is asked.
+        config: All options, as YAML.
+        ckpt_path: Checkpoint or run folder to sample with: of a sampler, or of a block-list network.
+        test_set: Dataset whose scenes are asked about; by default the frozen `testset-v1`.
+        split: Split of the dataset.
+        num_samples: Stacks of each scene.
+        seed: Seed of the sampler; with the batch size, the same stacks again.
+        predicted_lists: Whether the network's most likely block lists are asked with instead of the true ones.
+        limit: Number of scenes to ask about, from the first; all by default.
+        batch_size: Scenes sampled at once.
+        name: Name of the run.
+        runs: Folder of all runs.
+    """
+    if num_samples < 1 or batch_size < 1:
+        raise StackgenError("--num_samples and --batch_size must be at least 1")
+    loaded, scenes, dataset = load_both(subject, ckpt_path, test_set, limit, split)
+    model = loaded.model
+    folder = open_run(name, runs, "predict", config, dataset)
+    with progress_bar("scenes", len(scenes)) as (advance, _):
+        for number, start in enumerate(range(0, len(scenes), batch_size)):
+            batch = scenes[start : start + batch_size]
+            masks = np.stack([scene.silhouette for scene in batch])
+            block_lists = np.stack([scene.counts for scene in batch])
+            if predicted_lists:
+                block_lists = model.predictor.predict(masks)[:, 0]
+            samples = model.sampler.sample_batch(masks, block_lists, num_samples, batch_seed(seed, number))
+            for scene, block_list, stacks in zip(batch, block_lists, samples, strict=True):
+                content = StacksFile(
+                    tuple(map(StackEntry, stacks)),
+                    model.world,
+                    target=scene.silhouette,
+                    block_list=block_list,
+                    block_list_source="cnn" if predicted_lists else "given",
+                    seed=seed,
+                    weights=model.weights,
+                    sampler=model.sampler.settings,
+                )
+                write_stacks(folder / f"{scene.name}.json", content)
+            advance(start + len(batch))
+    print(f"wrote {len(scenes)} stacks files to {folder}")
+
+
+COMMAND = Command(
+    "predict",
+    main,
+    """
+    stackgen predict --ckpt_path runs/ddpm-small/version_0/checkpoints/last.ckpt
+    stackgen predict --test_set data/paper --split validation --limit 100
+    """,
+    settings={"subject": Method},
+    config="config",
+)
+
+
+def run(verb: str, argv: Sequence[str]) -> int | None:
+    """Run the verb."""
+    return COMMAND.run(arguments_of(verb, argv))
