@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from stackgen.data.generation.designs import draw_design, realize
+from stackgen.protocols import StabilityChecker
 from stackgen.sim.checkers import AcceptLimits, SimulatorChecker, accept, fell
 from stackgen.sim.physics import Physics, engine_version
 from stackgen.sim.simulator import Rollout
+from stackgen.sim.statics.checker import StaticsChecker
 from stackgen.stack import Stack
-from stackgen.world import PAPER_WORLD
+from stackgen.world import PAPER_WORLD, Catalogue, Shape
 
 LIMITS, PHYSICS = AcceptLimits(), Physics()
 
@@ -87,6 +91,30 @@ def test_the_early_end_gives_the_same_verdicts() -> None:
     for verdict, stack in zip(verdicts, stacks, strict=True):
         assert verdict.stable == (not verdict.fell.any()) == bool(verdict.drop.max() <= 0.5)
         assert (whole.check(stack).settled.poses == verdict.settled.poses).all()
+
+
+@pytest.mark.parametrize("make", [SimulatorChecker, StaticsChecker])
+def test_every_checker_says_of_many_stacks_what_it_says_of_each(make: Callable[[Physics], StabilityChecker]) -> None:
+    physics = Physics(friction=0.4)
+    checker = make(physics)
+    assert checker.physics == physics
+    stands = Stack([0, 0], [[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]])
+    falls = Stack([0, 0], [[0, 0, 0.5, 0, 0, 0], [0.9, 0, 1.5, 0, 0, 0]])
+    verdicts = checker.check_all(iter([stands, falls, stands]))
+    assert [verdict.stable for verdict in verdicts] == [True, False, True]
+    for stack, verdict in zip((stands, falls), verdicts, strict=False):
+        alone = checker.check(stack)
+        assert alone.fell.tolist() == verdict.fell.tolist() and (alone.drop == verdict.drop).all()
+
+
+def test_one_simulator_takes_stacks_of_several_catalogues() -> None:
+    tower = [[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]]
+    slabs = Catalogue((Shape.box("slab", 2, 0.5), Shape.box("cube", 1)))
+    stacks = [Stack([0, 0], tower), Stack([0, 1], [[0, 0, 0.25, 0, 0, 0], [0.4, 0, 1.0, 0, 0, 0]], slabs)]
+    together = SimulatorChecker().check_all(stacks + stacks)
+    for stack, first, again in zip(stacks, together[:2], together[2:], strict=True):
+        alone = SimulatorChecker().check(stack)
+        assert (alone.settled.poses == first.settled.poses).all() and (first.settled.poses == again.settled.poses).all()
 
 
 def test_the_physics_travel_with_the_engine_s_name() -> None:

@@ -2,36 +2,22 @@
 
 from __future__ import annotations
 
-import json
-import runpy
-import sys
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from stackgen.commands.cli import main
 from stackgen.errors import StackgenError
-from stackgen.geometry import iou, silhouette
+from stackgen.geometry import iou
 from stackgen.stack import Stack
-from stackgen.vision import depth, drawings
-from stackgen.vision.cameras import Rig, realsense_frame, simulated_frame
+from stackgen.vision import depth
+from stackgen.vision.cameras import Rig, simulated_frame
 from stackgen.vision.depth import DepthFrame, read_frame
-from stackgen.vision.masks import largest
 from stackgen.world import PAPER_GRID
+from tests.vision.conftest import ARCH, CASTLE, HOUSE, PHOTOS, truth
 
-read_silhouette = partial(drawings.read_silhouette, grid=PAPER_GRID)
 find_structure = partial(depth.find_structure, grid=PAPER_GRID)
-ROOT = Path(__file__).parents[2]
-PHOTOS = ROOT / "examples" / "photos"
-DRAWN = runpy.run_path(str(ROOT / "examples" / "draw_photos.py"))
-CASTLE, HOUSE, ARCH = (DRAWN[name] for name in ("CASTLE", "HOUSE", "ARCH"))
-
-
-def truth(stack: Stack) -> np.ndarray:
-    return read_silhouette(silhouette(stack, PAPER_GRID), exact=False)
 
 
 @pytest.mark.parametrize(
@@ -102,108 +88,5 @@ def test_a_frame_without_depth_is_refused() -> None:
         DepthFrame(np.ones((480, 640)), np.zeros((240, 320, 3), dtype=np.uint8))
 
 
-def test_the_largest_component_bridges_small_gaps_only() -> None:
-    mask = np.zeros((20, 30), dtype=bool)
-    mask[:, 2:10] = mask[:, 12:16] = mask[:, 25:28] = True
-    assert np.array_equal(np.flatnonzero(largest(mask, 4).any(axis=0)), [*range(2, 10), *range(12, 16)])
-    assert np.array_equal(np.flatnonzero(largest(mask, 0).any(axis=0)), [*range(2, 10)])
-
-
-def test_the_command_writes_what_sample_takes_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "castle.png"
-    assert main(["capture", "--depth", str(PHOTOS / "stack-castle-depth.png"), "--out", str(out)]) == 0
-    assert "mm wide" in capsys.readouterr().out
-    assert iou(read_silhouette(out), truth(CASTLE)) >= 0.9
-    assert (tmp_path / "castle-overlay.png").stat().st_size > 1000
-
-
-def test_a_simulated_capture_tells_its_iou(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = str(ROOT / "examples" / "stacks" / "arch.json")
-    assert main(["capture", "--simulate", file, "--elevation", "12", "--out", str(tmp_path / "a.png")]) == 0
-    assert float(capsys.readouterr().out.split("truth: ")[1]) >= 0.9
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        ([], "give one of --depth"),
-        (["--depth", "no.png"], "no.png: cannot be read: No such file"),
-        (["--depth", "zero.npy"], "zero.npy: the frame has no depth"),
-        (["--depth", "words.npy"], "words.npy: cannot be read"),
-        (["--depth", "empty.png"], "empty.png: is no depth frame"),
-        (["--depth", "wall.npy"], "nothing stands in front of the background"),
-        (["--realsense"], "RealSense"),
-        (["--sketch", "no.jpg", "--realsense"], "give one of"),
-    ],
-)
-def test_bad_input_is_one_line(
-    arguments: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, "pyrealsense2", _camera_that_is_not_there())
-    np.save("zero.npy", np.zeros((120, 160)))
-    np.save("wall.npy", np.ones((120, 160)))
-    np.save("words.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
-    Path("empty.png").touch()
-    assert main(["capture", "--out", "out.png", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert said in error and error.count("\n") == 1
-    assert not Path("out.png").exists()
-
-
-def _camera_that_is_not_there() -> SimpleNamespace:
-    """As pyrealsense2 is without a camera."""
-
-    def start(*_: object) -> None:
-        raise RuntimeError("No device connected")
-
-    return SimpleNamespace(
-        pipeline=lambda: SimpleNamespace(start=start),
-        config=lambda: SimpleNamespace(enable_stream=lambda *_: None),
-        stream=SimpleNamespace(depth=0, color=1),
-        format=SimpleNamespace(z16=0, rgb8=1),
-    )
-
-
-def test_without_the_package_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyrealsense2", None)
-    with pytest.raises(StackgenError, match=r"stackgen\[realsense\]"):
-        realsense_frame()
-
-
-def test_a_realsense_frame_is_depth_in_metres_seen_by_the_colour_camera(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Against a stand-in for the camera that sends a simulated frame, in units of a quarter of a millimetre."""
-    sent, stopped = simulated_frame(CASTLE), []
-    lens = SimpleNamespace(fx=sent.focal, ppx=320.0, ppy=240.0)
-    profile = SimpleNamespace(as_video_stream_profile=lambda: SimpleNamespace(intrinsics=lens))
-    frames = SimpleNamespace(
-        get_depth_frame=lambda: SimpleNamespace(get_data=lambda: np.round(sent.depth * 4000).astype(np.uint16)),
-        get_color_frame=lambda: SimpleNamespace(get_data=lambda: sent.colour, profile=profile),
-    )
-    sensor = SimpleNamespace(get_depth_scale=lambda: 0.00025)
-    device = SimpleNamespace(first_depth_sensor=lambda: sensor)
-    pipeline = SimpleNamespace(
-        start=lambda _: SimpleNamespace(get_device=lambda: device),
-        wait_for_frames=lambda _: frames,
-        stop=lambda: stopped.append(True),
-    )
-    camera = _camera_that_is_not_there()
-    camera.pipeline = lambda: pipeline
-    camera.align = lambda _: SimpleNamespace(process=lambda frames: frames)
-    monkeypatch.setitem(sys.modules, "pyrealsense2", camera)
-    frame = realsense_frame()
-    assert np.abs(frame.depth - sent.depth).max() < 2e-4 and stopped == [True]
-    assert frame.camera == (sent.focal, 320.0, 240.0)
-    assert iou(find_structure(frame).silhouette, truth(CASTLE)) >= 0.9
-
-
 def test_examples_stay_small() -> None:
     assert all(path.stat().st_size < 60_000 for path in PHOTOS.iterdir())
-
-
-def test_a_stack_number_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    file = ROOT / "examples" / "stacks" / "arch.json"
-    number = len(json.loads(file.read_text())["stacks"]) + 1
-    arguments = ["capture", "--simulate", str(file), "--stack", str(number), "--out", str(tmp_path / "a.png")]
-    assert main(arguments) == 2
-    assert "--stack must lie in 1.." in capsys.readouterr().err

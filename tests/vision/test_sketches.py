@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import runpy
 from functools import partial
 from pathlib import Path
 
@@ -12,24 +11,14 @@ import pytest
 
 from stackgen.commands.cli import main
 from stackgen.errors import StackgenError
-from stackgen.geometry import iou, silhouette
-from stackgen.stack import Stack
-from stackgen.vision import drawings, sketches
-from stackgen.vision.cells import EMPTY, FULL, TRIANGLE, block_list_of, in_cells, occupancy, picture_of
+from stackgen.geometry import iou
+from stackgen.vision import sketches
 from stackgen.vision.sketches import find_sheet, sheet_ratio
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID
+from stackgen.world import PAPER_GRID
+from tests.vision.conftest import DRAWN, PHOTOS, STACKS, truth
 
-read_silhouette = partial(drawings.read_silhouette, grid=PAPER_GRID)
 read_sketch = partial(sketches.read_sketch, grid=PAPER_GRID)
-ROOT = Path(__file__).parents[2]
-PHOTOS = ROOT / "examples" / "photos"
-DRAWN = runpy.run_path(str(ROOT / "examples" / "draw_photos.py"))
 Photo, sheet_with, photographed = (DRAWN[name] for name in ("Photo", "sheet_with", "photographed"))
-STACKS = {name: DRAWN[name] for name in ("ARCH", "CASTLE", "HOUSE")}
-
-
-def truth(name: str) -> np.ndarray:
-    return read_silhouette(silhouette(STACKS[name], PAPER_GRID), exact=False)
 
 
 @pytest.mark.parametrize("name", STACKS)
@@ -44,20 +33,20 @@ def truth(name: str) -> np.ndarray:
 )
 def test_the_drawing_is_recovered(name: str, photo: object) -> None:
     found = read_sketch(photographed(sheet_with(STACKS[name], photo), photo))
-    assert iou(found.silhouette, truth(name)) >= 0.9
-    assert iou(found.drawn, truth(name)) >= 0.85  # with the strokes' width and a hand's wobble
+    assert iou(found.silhouette, truth(STACKS[name])) >= 0.9
+    assert iou(found.drawn, truth(STACKS[name])) >= 0.85  # with the strokes' width and a hand's wobble
 
 
 @pytest.mark.parametrize("name", STACKS)
 def test_the_examples_show_their_stacks(name: str) -> None:
     found = read_sketch(PHOTOS / f"sketch-{name.lower()}.jpg")
-    assert iou(found.silhouette, truth(name)) >= 0.95
+    assert iou(found.silhouette, truth(STACKS[name])) >= 0.95
     assert found.block_list is not None
 
 
 def test_a_photo_of_the_bare_sheet_needs_no_table() -> None:
     found = read_sketch(np.repeat(sheet_with(STACKS["ARCH"], Photo())[..., None], 3, axis=2))
-    assert iou(found.silhouette, truth("ARCH")) >= 0.95
+    assert iou(found.silhouette, truth(STACKS["ARCH"])) >= 0.95
 
 
 def test_the_sheet_is_found_where_it_lies() -> None:
@@ -73,35 +62,6 @@ def test_a_rectangle_seen_askew_has_its_own_proportions() -> None:
     corners = corners @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
     points = np.stack([corners[:, 0], corners[:, 1] * np.cos(lean), 6 + corners[:, 1] * np.sin(lean)], axis=1)
     assert sheet_ratio(focal * points[:, :2] / points[:, 2:], 800.0) == pytest.approx(1.5, rel=0.02)
-
-
-def test_cells_and_their_picture_are_inverse() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        cells = rng.choice([EMPTY, FULL], (4, 4))
-        top = np.argmax(np.vstack([cells, np.zeros((1, 4), int)]) == EMPTY, axis=0)
-        cells[np.minimum(top, 3)[0], 0] = FULL
-        cells[3, 1] = TRIANGLE
-        assert np.array_equal(occupancy(picture_of(cells, PAPER_GRID), PAPER_GRID), cells)
-
-
-def test_blocks_that_stick_out_of_the_grid_make_no_triangles() -> None:
-    long, cells = PAPER_CATALOGUE.index("long_rectangle"), np.array([[1, 1, 1, 0], [0, 1, 1, 1]] * 2)
-    xs = [-0.65, 0.6, -0.5, 0.6]
-    poses = np.array([[x, 0, row + 0.5, 0, 0, 0] for row, x in enumerate(xs)])
-    as_read = read_silhouette(silhouette(Stack(np.full(4, long), poses), PAPER_GRID), exact=False)
-    whole, found, _ = in_cells(as_read, 0.85, PAPER_GRID)
-    assert found is not None and found.tolist() == cells.tolist()
-    assert np.array_equal(whole, picture_of(cells, PAPER_GRID))
-
-
-@pytest.mark.parametrize(
-    ("row", "counts"),
-    [([1, 1, 1, 1], [1, 0, 1, 0]), ([1, 1, 0, 1], [1, 1, 0, 0]), ([0, 2, 1, 2], [1, 0, 0, 2]), ([0, 0, 0, 0], None)],
-)
-def test_the_heuristic_takes_the_longest_blocks_that_fit(row: list[int], counts: list[int] | None) -> None:
-    found = block_list_of(np.array([row]))
-    assert (None if found is None else found.tolist()) == counts
 
 
 def page() -> np.ndarray:
@@ -178,15 +138,3 @@ def test_no_photo_is_named(tmp_path: Path) -> None:
     (tmp_path / "text.jpg").write_text("no picture")
     with pytest.raises(StackgenError, match=r"text\.jpg: is not an image"):
         read_sketch(tmp_path / "text.jpg")
-
-
-def test_the_command_writes_silhouette_and_overlay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "house.png"
-    cv2.imwrite(str(tmp_path / "truth.png"), truth("HOUSE").astype(np.uint8) * 255)
-    photo = str(PHOTOS / "sketch-house.jpg")
-    assert main(["capture", "--sketch", photo, "--truth", str(tmp_path / "truth.png"), "--out", str(out)]) == 0
-    said = capsys.readouterr().out
-    assert "block list by the heuristic: cube=2" in said
-    assert float(said.split("truth: ")[1]) >= 0.95
-    assert iou(read_silhouette(out), truth("HOUSE")) >= 0.95
-    assert (tmp_path / "house-overlay.png").exists()

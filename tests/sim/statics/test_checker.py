@@ -5,125 +5,38 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.optimize import linprog
-from scipy.spatial import ConvexHull
-from scipy.spatial.transform import Rotation
 
-from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.errors import StackgenError
-from stackgen.geometry import centers_of_mass, mirror
+from stackgen.geometry import mirror
 from stackgen.io.stacks_file import read_stacks
 from stackgen.sim.physics import Physics
 from stackgen.sim.statics.checker import StaticsChecker
-from stackgen.sim.statics.contacts import GROUND, Contact, find_contacts
-from stackgen.sim.statics.programs import inradius
+from stackgen.sim.statics.contacts import find_contacts
 from stackgen.stack import Stack
 from stackgen.world import Catalogue, Shape
 from tests.conftest import Cli, stacks_json
-
-CUBE, RECTANGLE, LONG, TRIANGLE = range(4)
-FREE = StaticsChecker(safety=0)
-"""Takes all that could stand."""
-
-
-def stack(*blocks: tuple[int, float, float], yaw: float = 0) -> Stack:
-    """Blocks of (shape, x, z), turned about the vertical through the origin."""
-    shapes = [shape for shape, _, _ in blocks]
-    return turned(Stack(np.array(shapes), np.array([[x, 0, z, 0, 0, 0] for _, x, z in blocks], dtype=float)), yaw)
-
-
-def turned(upright: Stack, yaw: float, shift: tuple[float, float] = (0, 0)) -> Stack:
-    """The whole stack turned about the vertical and moved on the ground."""
-    turn = Rotation.from_rotvec([0, 0, yaw])
-    poses = upright.poses.copy()
-    poses[:, :3] = turn.apply(poses[:, :3]) + [*shift, 0]
-    poses[:, 3:] = (turn * Rotation.from_rotvec(upright.poses[:, 3:])).as_rotvec()
-    return upright.with_poses(poses)
+from tests.sim.statics.conftest import (
+    CUBE,
+    FREE,
+    LONG,
+    RECTANGLE,
+    TRIANGLE,
+    settled_stacks,
+    shaken,
+    stack,
+    turned,
+    without,
+)
 
 
 def slope(stack: Stack, friction: float = 0.5) -> float:
     """Tangent of the margin."""
     return math.tan(StaticsChecker(Physics(friction=friction), safety=0).answer(stack).margin)
-
-
-def settled_stacks(number: int, start: int = 0) -> list[Stack]:
-    """Some of the frozen test set."""
-    testset = Dataset.open(TESTSET)
-    return [sample.stack(testset.world.catalogue) for sample in islice(testset.samples("test"), start, start + number)]
-
-
-def without(whole: Stack, block: int) -> Stack:
-    """A stack less one block."""
-    keep = np.arange(len(whole)) != block
-    return Stack(whole.shapes[keep], whole.poses[keep], whole.catalogue)
-
-
-# Contacts.
-
-
-def area(contact: Contact) -> float:
-    """Of the patch [cell^2]."""
-    along = contact.points @ np.stack([contact.tangent, np.cross(contact.normal, contact.tangent)], axis=1)
-    return float(ConvexHull(along).volume)
-
-
-def one_contact(pair: Stack, tolerance: float = 0.02) -> Contact:
-    """The one patch between two blocks."""
-    (contact,) = [c for c in find_contacts(pair, tolerance) if c.by != GROUND]
-    return contact
-
-
-@pytest.mark.parametrize("d", [0.0, 0.3, -0.7])
-@pytest.mark.parametrize("yaw", [0.0, 0.4])
-def test_patch_of_displaced_cubes_is_their_overlap(d: float, yaw: float) -> None:
-    contact = one_contact(stack((CUBE, 0, 0.5), (CUBE, d, 1.5), yaw=yaw))
-    assert area(contact) == pytest.approx(1 - abs(d))
-    assert (contact.block, contact.by) == (1, 0)
-    np.testing.assert_allclose(contact.normal, [0, 0, 1], atol=1e-12)
-    np.testing.assert_allclose(contact.points[:, 2], 1)
-
-
-def test_patch_of_a_cube_turned_by_an_eighth_is_an_octagon() -> None:
-    poses = np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, np.pi / 4]])
-    contact = one_contact(Stack(np.array([CUBE, CUBE]), poses))
-    assert len(contact.points) == 8
-    assert area(contact) == pytest.approx(2 * (math.sqrt(2) - 1))
-
-
-@pytest.mark.parametrize(("gap", "touch"), [(-0.05, True), (0.0, True), (0.019, True), (0.021, False)])
-def test_faces_touch_up_to_the_tolerance(gap: float, touch: bool) -> None:
-    contacts = find_contacts(stack((CUBE, 0, 0.5), (CUBE, 0, 1.5 + gap)), 0.02)
-    assert len(contacts) == 1 + touch
-
-
-def test_a_slightly_tilted_block_touches_as_far_as_the_tolerance_goes() -> None:
-    tilt = 0.05
-    poses = np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1 + 0.5 * (math.cos(tilt) + math.sin(tilt)), 0, tilt, 0]])
-    contact = one_contact(Stack(np.array([CUBE, CUBE]), poses))
-    assert np.ptp(contact.points[:, 0]) == pytest.approx(0.02 / math.tan(tilt), rel=0.01)
-
-
-def test_a_block_on_a_slope_touches_it_along_its_normal() -> None:
-    up = np.array([2, 0, 1]) / math.sqrt(5)  # out of the triangle's right face
-    middle = np.array([0.25, 0, 0.5])
-    center = middle + up / 2
-    poses = np.array([[0, 0, 0.5, 0, 0, 0], [*center, 0, math.atan2(up[0], up[2]), 0]])
-    contact = one_contact(Stack(np.array([TRIANGLE, CUBE]), poses))
-    np.testing.assert_allclose(np.abs(contact.normal @ up), 1)
-    assert area(contact) == pytest.approx(1)
-
-
-def test_an_apex_touches_along_a_line_and_neighbours_side_by_side() -> None:
-    apex = one_contact(stack((TRIANGLE, 0, 0.5), (CUBE, 0.2, 1.5)))
-    assert len(apex.points) == 2 and np.ptp(apex.points, axis=0) == pytest.approx([0, 1, 0])
-    side = one_contact(stack((CUBE, 0, 0.5), (CUBE, 1.01, 0.5)))
-    assert abs(side.normal[0]) == pytest.approx(1) and area(side) == pytest.approx(1)
 
 
 # The margin.
@@ -262,43 +175,7 @@ def test_no_blocks_stand_and_wrong_settings_are_named() -> None:
             StaticsChecker(contact_tolerance=tolerance, safety=safety)
 
 
-def corner_forces_hold(whole: Stack, friction: float = 0.5) -> bool:
-    """The textbook's linear program: a force in each corner of each patch, solved by SciPy."""
-    centers, columns = centers_of_mass(whole), []
-    for contact in find_contacts(whole, FREE.contact_tolerance):
-        across = np.cross(contact.normal, contact.tangent)
-        signs = [(0, 0)] if contact.upright else [(1, 1), (1, -1), (-1, 1), (-1, -1)]
-        for point in contact.points:
-            for a, b in signs:
-                force = contact.normal + friction * (a * contact.tangent + b * across)
-                column = np.zeros((len(whole), 6))
-                column[contact.block] = np.r_[force, np.cross(point - centers[contact.block], force)]
-                if contact.by != GROUND:
-                    column[contact.by] = -np.r_[force, np.cross(point - centers[contact.by], force)]
-                columns.append(column.ravel())
-    needed = np.zeros((len(whole), 6))
-    needed[:, 2] = [whole.catalogue[shape].volume for shape in whole.shapes]
-    return bool(linprog(np.zeros(len(columns)), A_eq=np.array(columns).T, b_eq=needed.ravel()).status == 0)
-
-
-def test_forces_of_patches_exist_where_forces_at_their_corners_do() -> None:
-    rng = np.random.default_rng(2)
-    held = []
-    for whole in shaken(60):
-        noisy = whole.with_poses(whole.poses + rng.normal(0, 0.02, whole.poses.shape))
-        for one in (whole, noisy):
-            held.append(corner_forces_hold(one))
-            assert FREE.answer(one).stable == held[-1]
-    assert 20 < sum(held) < 100
-
-
 # Symmetries.
-
-
-def shaken(number: int) -> list[Stack]:
-    """Settled stacks, some whole, some less a block: both verdicts occur."""
-    rng = np.random.default_rng(3)
-    return [s if i % 3 else without(s, int(rng.integers(len(s)))) for i, s in enumerate(settled_stacks(number))]
 
 
 def same(a: Stack, b: Stack, order: NDArray[np.int64] | None = None) -> None:
@@ -336,22 +213,6 @@ def test_what_is_not_stable_has_a_block_that_is_not_held() -> None:
             verdict = StaticsChecker(safety=safety).check(noisy)
             assert verdict.stable != verdict.fell.any()
             assert verdict.margin is not None and verdict.stable <= (verdict.margin >= safety)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_inradius_of_a_polygon_is_the_distance_of_its_nearest_side(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    corners = rng.normal(size=(12, 2)) @ rng.normal(size=(2, 2))
-    corners -= corners.mean(axis=0)
-    hull = ConvexHull(corners)
-    asked = []
-
-    def furthest(direction: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        asked.append(direction)
-        return corners[(corners @ direction).argmax()], direction
-
-    assert inradius(furthest)[0] == pytest.approx(-hull.equations[:, 2].max(), abs=1e-3)
-    assert len(asked) <= 4 + 2 * len(hull.vertices)
 
 
 # The simulator's opinion.

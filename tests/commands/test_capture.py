@@ -1,0 +1,77 @@
+"""stackgen capture: silhouettes and overlays are written, bad input is one line."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stackgen.commands.cli import main
+from stackgen.geometry import iou
+from stackgen.viz.render import save_image
+from tests.vision.conftest import CASTLE, HOUSE, PHOTOS, ROOT, camera_that_is_not_there, read_silhouette, truth
+
+
+def test_the_command_writes_what_sample_takes_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "castle.png"
+    assert main(["capture", "--depth", str(PHOTOS / "stack-castle-depth.png"), "--out", str(out)]) == 0
+    assert "mm wide" in capsys.readouterr().out
+    assert iou(read_silhouette(out), truth(CASTLE)) >= 0.9
+    assert (tmp_path / "castle-overlay.png").stat().st_size > 1000
+
+
+def test_a_simulated_capture_tells_its_iou(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = str(ROOT / "examples" / "stacks" / "arch.json")
+    assert main(["capture", "--simulate", file, "--elevation", "12", "--out", str(tmp_path / "a.png")]) == 0
+    assert float(capsys.readouterr().out.split("truth: ")[1]) >= 0.9
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "give one of --depth"),
+        (["--depth", "no.png"], "no.png: cannot be read: No such file"),
+        (["--depth", "zero.npy"], "zero.npy: the frame has no depth"),
+        (["--depth", "words.npy"], "words.npy: cannot be read"),
+        (["--depth", "empty.png"], "empty.png: is no depth frame"),
+        (["--depth", "wall.npy"], "nothing stands in front of the background"),
+        (["--realsense"], "RealSense"),
+        (["--sketch", "no.jpg", "--realsense"], "give one of"),
+    ],
+)
+def test_bad_input_is_one_line(
+    arguments: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", camera_that_is_not_there())
+    np.save("zero.npy", np.zeros((120, 160)))
+    np.save("wall.npy", np.ones((120, 160)))
+    np.save("words.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    Path("empty.png").touch()
+    assert main(["capture", "--out", "out.png", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+    assert not Path("out.png").exists()
+
+
+def test_a_stack_number_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = ROOT / "examples" / "stacks" / "arch.json"
+    number = len(json.loads(file.read_text())["stacks"]) + 1
+    arguments = ["capture", "--simulate", str(file), "--stack", str(number), "--out", str(tmp_path / "a.png")]
+    assert main(arguments) == 2
+    assert "--stack must lie in 1.." in capsys.readouterr().err
+
+
+def test_the_command_writes_silhouette_and_overlay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "house.png"
+    save_image(tmp_path / "truth.png", truth(HOUSE))
+    photo = str(PHOTOS / "sketch-house.jpg")
+    assert main(["capture", "--sketch", photo, "--truth", str(tmp_path / "truth.png"), "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "block list by the heuristic: cube=2" in said
+    assert float(said.split("truth: ")[1]) >= 0.95
+    assert iou(read_silhouette(out), truth(HOUSE)) >= 0.95
+    assert (tmp_path / "house-overlay.png").exists()
