@@ -157,6 +157,15 @@ def test_a_build_leaves_report_stack_picture_and_film(cli: Cli, stacks: Path, tm
     assert film.read_bytes()[:4] == b"GIF8" and [path.name for path in film.parent.iterdir()] == ["film.gif"]
 
 
+def test_another_arm_builds_by_its_configuration_alone(cli: Cli, stacks: Path, tmp_path: Path) -> None:
+    options = ("--config", CONFIG.with_name("panda.yaml"), "--grasp", "fixed", "--cell.staging.straighten", "false")
+    answer = cli("build", stacks, *options, "--out", tmp_path / "out")
+    assert answer.code == 0 and "built, and stands" in answer.out, answer.err
+    report = json.loads((tmp_path / "out" / "build.json").read_text())
+    assert len(report["torque"]) == 7 and report["cell"]["arm"]["flange"] == "panda_link8"
+    assert report["blocks"][0]["ik_distance"] < 1e-3 and report["unplanned_contacts"] == 0  # [mm]
+
+
 @pytest.mark.usefixtures("nothing_moves")
 def test_for_a_real_arm_a_dry_run_leaves_program_and_sheet(cli: Cli, stacks: Path, tmp_path: Path) -> None:
     out, sheet = tmp_path / "out", tmp_path / "sheet.svg"
