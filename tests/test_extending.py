@@ -6,6 +6,7 @@ import importlib
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,8 +14,7 @@ import yaml
 
 from stackgen.commands.generate import COMMAND as GENERATE
 from stackgen.data.generation.generate import GenerateSettings
-from stackgen.evaluation.metrics import SampleScore, SceneScore, scene_metrics
-from stackgen.evaluation.results import METRICS
+from stackgen.evaluation.metrics import METRICS, SampleScore, SceneScore
 from stackgen.models.weights import last_checkpoint
 from tests.conftest import Cli, TinyWeights
 
@@ -44,46 +44,38 @@ def test_a_model_of_one_s_own_is_trained_watched_and_measured(
 ) -> None:
     small = ["--model.width", 8, "--trainer.max_steps", 4, "--trainer.log_every_n_steps", 1]
     quiet = ["--trainer.enable_progress_bar", "false", "--trainer.enable_model_summary", "false"]
-    data = ["--data.path", towers_dataset, "--data.test_path", towers_dataset]
-    answer = cli("fit", "--config", EXAMPLES / "model.yaml", *data, "--data.batch_size", 24, *small, *quiet)
+    data = ["--data.path", towers_dataset, "--data.batch_size", 24]
+    answer = cli("fit", "--config", EXAMPLES / "model.yaml", *data, *small, *quiet)
     assert answer.code == 0, answer.err
     text = Path("runs/silhouette-mlp/version_0/metrics.csv").read_text()
     assert "sample/best_of_all" in text and "validation/loss" in text
     weights = "{class_path: examples.extending.sampler.MLPSampler, init_args: {trained: CKPT}}"
     weights = weights.replace("CKPT", str(last_checkpoint(Path("runs/silhouette-mlp"))))
-    options = ["--model.weights", weights, "--model.block_list_weights", tiny.predictor]
-    answer = cli("test", *options, *data, "--model.predicted_lists", "false", *quiet)
-    assert answer.code == 0, answer.err
-    rows = json.loads(Path("runs/run/test_0/metrics.json").read_text())["rows"]
-    assert rows[0]["method"] == "MLPSampler" and "best_of_all" in rows[0]["metrics"]
+    row = measured(cli, weights, towers_dataset, tiny)
+    assert row["method"] == "MLPSampler" and "best_of_all" in row["metrics"]
 
 
 def test_a_method_that_learns_nothing_is_measured(
     cli: Cli, outside: None, towers_dataset: Path, tiny: TinyWeights
 ) -> None:
-    options = [
-        "--model.weights",
-        "{class_path: examples.extending.columns.Columns}",
-        "--model.block_list_weights",
-        tiny.predictor,
-    ]
-    data = ["--data.path", towers_dataset, "--data.test_path", towers_dataset]
-    quiet = ["--trainer.enable_progress_bar", "false", "--model.predicted_lists", "false"]
-    answer = cli("test", *options, *data, *quiet)
-    assert answer.code == 0, answer.err
-    row = json.loads(Path("runs/run/test_0/metrics.json").read_text())["rows"][0]
+    row = measured(cli, "{class_path: examples.extending.columns.Columns}", towers_dataset, tiny)
     assert row["metrics"]["stability"]["value"] > 0.9 and row["metrics"]["front_iou"]["value"] > 0.5
+
+
+def measured(cli: Cli, weights: str, dataset: Path, tiny: TinyWeights) -> dict[str, Any]:
+    """The first row of `stackgen test`."""
+    options = ["--block_list_weights", tiny.predictor, "--predicted_lists", "false", "--test_set", dataset]
+    answer = cli("test", "--weights", weights, *options)
+    assert answer.code == 0, answer.err
+    return json.loads(Path("runs/run/test_0/metrics.json").read_text())["rows"][0]
 
 
 def test_a_metric_of_one_s_own_is_measured_with_the_others(no_new_metrics: None) -> None:
     good, bad = (SampleScore(stable, {"front": 0.9 * stable}, 0.9, ()) for stable in (True, False))
-    scenes = [SceneScore((good, bad)), SceneScore((bad, bad))]
-    before = scene_metrics()
+    before = set(METRICS)
     importlib.import_module("examples.extending.metric")
-    after = scene_metrics("test/")
-    after.update(scenes)
-    assert float(after.compute()["test/best_of_all"]) == 0.5
-    assert set(METRICS) == {*before, "best_of_all", "side_iou", "top_iou"}
+    assert set(METRICS) == {*before, "best_of_all"}
+    assert [METRICS["best_of_all"](SceneScore(samples)) for samples in ((good, bad), (bad, bad))] == [(1, 1), (0, 1)]
 
 
 def test_a_shape_of_one_s_own_is_data(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """A metric of your own: how often at least one of a scene's samples stands and matches."""
 
 from stackgen.evaluation.metrics import SCENE_METRICS, SceneScore
-from stackgen.training.callbacks import SampleQuality
+from stackgen.training import SampleQuality
 
 
 def best_of_all(scene: SceneScore) -> tuple[float, float]:
@@ -9,7 +9,7 @@ def best_of_all(scene: SceneScore) -> tuple[float, float]:
     return float(any(sample.valid for sample in scene.samples)), 1
 
 
-SCENE_METRICS["best_of_all"] = best_of_all  # in logs, in `metrics.json` with its interval, and under Trainer.test
+SCENE_METRICS["best_of_all"] = best_of_all  # in logs, and in `metrics.json` with its interval
 
 
 class Quality(SampleQuality):

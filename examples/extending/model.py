@@ -1,23 +1,24 @@
 """A model of your own: an MLP from silhouette and block list to poses, trained, watched and measured like ours."""
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from stackgen.models.module import StackgenModule
+from stackgen.models.optimization import OptimizerConfig
 from stackgen.models.poses import raster_order
 from stackgen.models.transformer import mlp
 from stackgen.world import World
 
 
 class SilhouetteMLP(StackgenModule):
-    """A StackgenModule learns its world from the data, calls `make` when it knows it, and brings AdamW."""
+    """StackgenModule learns the world from the data, and calls `make` when it knows it."""
 
     kind = "silhouette-mlp"
 
-    def __init__(self, width: int = 256) -> None:
-        super().__init__({"width": width})
+    def __init__(self, width: int = 256, learning_rate: float = 1e-3) -> None:
+        super().__init__({"width": width}, OptimizerConfig(learning_rate=learning_rate))
 
-    def make(self, world: World) -> torch.nn.Module:
+    def make(self, world: World) -> nn.Module:
         return mlp(world.grid.image_size**2 + len(world.catalogue), self.config["width"], world.max_blocks * 6)
 
     def forward(self, silhouettes: Tensor, counts: Tensor) -> Tensor:

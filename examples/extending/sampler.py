@@ -1,4 +1,4 @@
-"""The model of model.py as a StackSampler, which can be measured, reported, drawn and built."""
+"""The model of model.py as evaluation, report, drawings and the robot want it: a StackSampler."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,7 +14,7 @@ from stackgen.world import Mask
 
 
 class MLPSampler:
-    """A StackSampler: the world it knows, what is on record, and `sample_batch`; from a module or a checkpoint."""
+    """One method, `sample_batch`, and what is known of it; here from a module in training, or from a checkpoint."""
 
     settings: Mapping[str, Any] = {}
 
@@ -27,7 +27,8 @@ class MLPSampler:
         self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
     ) -> list[list[Stack]]:
         poses = self.module(torch.from_numpy(silhouettes).float(), torch.from_numpy(counts)).double().numpy()
-        stacks = [Stack(shapes_of(c), p[: c.sum()], self.world.catalogue) for c, p in zip(counts, poses, strict=True)]
+        catalogue = self.world.catalogue
+        stacks = [Stack(shapes_of(c), p[: c.sum()], catalogue) for c, p in zip(counts, poses, strict=True)]
         return [[stack] * num_samples for stack in stacks]
 
 

@@ -16,7 +16,7 @@ from stackgen.errors import StackgenError
 from stackgen.evaluation.metrics import SCENE_METRICS
 from stackgen.evaluation.protocol import Scene, batch_seed, check_scenes, scenes_of_batch
 from stackgen.models.weights import read_weights
-from stackgen.protocols import StabilityChecker, StackSampler, Verdict
+from stackgen.protocols import PhysicsNumbers, StabilityChecker, StackSampler, Verdict
 from stackgen.stack import Stack
 from stackgen.training.loggers import log_picture
 from stackgen.training.plots import silhouette_sheet
@@ -290,6 +290,11 @@ class SampleQuality(pl.Callback):
 
 class _NoPhysics(StabilityChecker):
     """Stands in for a checker where there is none, for metrics that ignore physics: nothing moves."""
+
+    @property
+    def physics(self) -> PhysicsNumbers:
+        """There is none."""
+        raise NotImplementedError
 
     def check(self, stack: Stack) -> Verdict:
         """See StabilityChecker."""
