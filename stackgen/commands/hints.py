@@ -1,4 +1,4 @@
-"""`did you mean`: what a user wrote beside what a parser knows."""
+"""`did you mean`: the option, key or class that is nearest to what a user wrote."""
 
 from __future__ import annotations
 
@@ -18,11 +18,14 @@ _NAME = re.compile(r"module '(?P<module>[\w.]+)' has no attribute '(?P<name>\w+)
 
 
 def did_you_mean(parser: ArgumentParser, message: str) -> str:
-    """The nearest option, key or class to one that does not exist, as words to put behind the message; or nothing.
+    """Name the option, key or class that is nearest to one that does not exist, in words that follow the message.
 
     Args:
-        parser: Of the verb.
-        message: What jsonargparse says of its command line.
+        parser: Parser of the verb.
+        message: Message of jsonargparse about the command line.
+
+    Returns:
+        The words, or nothing if none is near or the message is about something else.
 
     >>> parser = ArgumentParser()
     >>> _ = parser.add_argument("--num_samples")
@@ -45,12 +48,12 @@ def did_you_mean(parser: ArgumentParser, message: str) -> str:
 
 
 def options_of(parser: ArgumentParser) -> list[str]:
-    """All options of a parser, with their dashes."""
+    """List all options of a parser, with their dashes."""
     return [option for action in parser._actions for option in action.option_strings]
 
 
 def _parser_of(class_path: str) -> ArgumentParser:
-    """The options of a class that a configuration names; the message that names it comes from the class itself."""
+    """Make a parser of the options of a class; it can be imported, for the message comes from its own parser."""
     module, _, name = class_path.rpartition(".")
     parser = ArgumentParser(exit_on_error=False)
     parser.add_class_arguments(getattr(importlib.import_module(module), name), sub_configs=True, fail_untyped=False)
