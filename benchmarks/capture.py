@@ -1,8 +1,8 @@
 """From a stack to a stack through a depth camera: the silhouette as seen, and that of the cells it is made of.
 
 Settled stacks of testset-v1 stand before the simulated camera, which is somewhere in front of them. Both silhouettes
-are compared with the stack's own, and each is asked for one verified stack, whose silhouette is compared with the
-stack's own too.
+are compared with the stack's own. For each of them one verified stack is sampled, whose silhouette is compared with the
+stack's own, too.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ KINDS = ("as seen", "in cells")
 
 @dataclass(frozen=True)
 class Case:
-    """One stack.
+    """What the camera made of one stack.
 
     Args:
         seen: IoU of each kind of silhouette with the stack's own.
         whole: Whether the structure was taken to be made of whole cells.
-        left_out: What stood beside it, as a share of it.
-        stands: Whether a verified stack for each kind stands.
-        again: IoU of its silhouette with the first stack's own.
+        left_out: What stood beside the structure, as a share of it.
+        stands: Whether the verified stack for each kind of silhouette stands.
+        again: IoU of the verified stacks' silhouettes with the first stack's own.
     """
 
     seen: tuple[float, ...]
@@ -51,13 +51,15 @@ class Case:
 def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
-    options.add_argument("--number", type=int, default=100, help="stacks")
-    options.add_argument("--seed", type=int, default=0, help="of the draw, the cameras, their noise and the samples")
+    options.add_argument("--number", type=int, default=100, help="number of stacks")
+    options.add_argument(
+        "--seed", type=int, default=0, help="seed of the draw, the cameras, their noise and the samples"
+    )
     return options
 
 
 def main() -> None:
-    """See, sample, compare."""
+    """Simulate the camera, sample and compare."""
     options = parser().parse_args()
     if options.number < 1:
         raise StackgenError("--number must be at least 1")
@@ -75,7 +77,7 @@ def main() -> None:
 
 
 def case(stack: Stack, rng: np.random.Generator, model: Model) -> Case:
-    """A stack before a camera somewhere in front of it."""
+    """Put a stack before a camera somewhere in front of it."""
     distance, elevation, azimuth = rng.uniform([0.55, 0, -15], [0.9, 25, 15])
     rig = Rig(float(distance), float(elevation), float(azimuth))
     seed = int(rng.integers(2**31))
@@ -93,7 +95,7 @@ def case(stack: Stack, rng: np.random.Generator, model: Model) -> Case:
 
 
 def own_silhouette(stack: Stack) -> Mask:
-    """(H, W) framed as captured ones are."""
+    """The stack's silhouette (H, W), framed as captured ones are."""
     return read_silhouette(silhouette(stack, PAPER_GRID), PAPER_GRID, exact=False)
 
 
@@ -111,7 +113,7 @@ def summary(cases: Sequence[Case], kind: int) -> dict[str, Any]:
 
 
 def table(figures: Mapping[str, Any]) -> Any:
-    """What is printed."""
+    """The table to print."""
 
     def share(e: Mapping[str, float]) -> str:
         return f"{100 * e['value']:.1f} ({100 * e['low']:.1f} to {100 * e['high']:.1f})"

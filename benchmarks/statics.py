@@ -1,8 +1,8 @@
 """How often statics and PyBullet agree, and what statics costs.
 
-Judges settled stacks of testset-v1, others of them less a block, and still others with noise on every
+The stacks are settled ones of testset-v1, others of them less a block, and still others with noise on every
 coordinate, which float and interpenetrate a little as a network's samples do; or the stacks of files.
-Times are of the process: on a busy machine they are too long, never too short.
+Times are process times: on a busy machine they are too long, never too short.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Case:
-    """A stack, where it came from and what both say of it; statics without a safety margin."""
+    """A stack, where it came from, and what PyBullet and statics, without a safety margin, say of it."""
 
     kind: str
     name: str
@@ -53,15 +53,15 @@ class Case:
 def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
-    options.add_argument("--number", type=int, default=200, help="stacks of each kind")
+    options.add_argument("--number", type=int, default=200, help="number of stacks of each kind")
     options.add_argument("--noise", type=float, default=0.02, help="standard deviation on all coordinates [cell, rad]")
-    options.add_argument("--seed", type=int, default=0, help="of the draw, the removals and the noise")
-    options.add_argument("--files", type=Path, nargs="*", default=[], help="stacks files to judge instead")
+    options.add_argument("--seed", type=int, default=0, help="seed of the draw, the removals and the noise")
+    options.add_argument("--files", type=Path, nargs="*", default=[], help="stacks files to check instead")
     return options
 
 
 def main() -> None:
-    """Judge, compare, time."""
+    """Check, compare, measure times."""
     options = parser().parse_args()
     if options.number < 1:
         raise StackgenError("--number must be at least 1")
@@ -91,7 +91,7 @@ def from_files(files: Sequence[Path]) -> list[tuple[str, str, Stack]]:
 
 
 def drawn(options: argparse.Namespace) -> list[tuple[str, str, Stack]]:
-    """Stacks of each kind, drawn anew for each."""
+    """Stacks of each kind, each kind with its own draw."""
     testset = Dataset.open(TESTSET)
     samples = list(testset.samples("test"))
     rng = np.random.default_rng(options.seed)
@@ -109,7 +109,7 @@ def drawn(options: argparse.Namespace) -> list[tuple[str, str, Stack]]:
 
 
 def groups(cases: Sequence[Case]) -> dict[str, list[Case]]:
-    """By kind, and the first two kinds together: neither floats."""
+    """The cases by kind, and those of the first two kinds together: neither floats."""
     by_kind = {kind: [case for case in cases if case.kind == kind] for kind in dict.fromkeys(c.kind for c in cases)}
     if set(KINDS) <= set(by_kind):
         by_kind["settled and less a block"] = by_kind[KINDS[0]] + by_kind[KINDS[1]]
@@ -131,7 +131,7 @@ def simulated(cases: Sequence[Case]) -> Flags:
 
 
 def agreement(cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """Of the verdicts, without and with the safety margin."""
+    """Agreement of the verdicts, without and with the safety margin."""
     return [
         {
             "stacks": kind,
@@ -157,7 +157,7 @@ def tolerances(cases: Sequence[Case]) -> list[dict[str, Any]]:
 
 
 def unheld(cases: Sequence[Case]) -> dict[str, Any]:
-    """How well the blocks named are those that the simulator moved, where both see a fall."""
+    """How well the blocks that statics names are those that the simulator moved, where both see a fall."""
     pairs = [
         (case.statics.unheld, np.abs(case.simulated.settled.poses - case.stack.poses)[:, :3].max(axis=1) > MOVED)
         for case in cases
@@ -175,7 +175,7 @@ def unheld(cases: Sequence[Case]) -> dict[str, Any]:
 
 
 def times(stacks: Sequence[Stack]) -> dict[str, Any]:
-    """Of a verdict with its margin, by number of blocks, and of the push."""
+    """Process times of a verdict with its margin, by number of blocks, and of the push."""
     checker = StaticsChecker()
     each = np.array([milliseconds(lambda s=stack: checker.check(s)) for stack in stacks])  # type: ignore[misc]
     sizes = np.array([len(stack) for stack in stacks])
@@ -199,7 +199,7 @@ def milliseconds(work: Callable[[], object], repeats: int = 5) -> float:
 
 
 def disagreements(cases: Sequence[Case]) -> list[dict[str, Any]]:
-    """Every stack on which the two differ, with the safety margin."""
+    """Every stack on which statics with the safety margin and PyBullet differ."""
     return [
         {
             "stacks": case.kind,
@@ -215,7 +215,7 @@ def disagreements(cases: Sequence[Case]) -> list[dict[str, Any]]:
 
 
 def tables(figures: dict[str, Any]) -> list[Any]:
-    """What is printed."""
+    """The tables to print."""
     shares = ("agree", "false_stable", "false_unstable")
     percent = [f"{name.replace('_', ' ')} [%]" for name in shares]
     verdicts = [

@@ -29,14 +29,14 @@ class Photo:
     """How a sheet is drawn on and photographed.
 
     Args:
-        filled: Blocks are filled, else drawn in outline, each for itself.
+        filled: Whether blocks are filled; otherwise each is drawn in outline.
         slant: How far the corners of the sheet are from those of an upright one [share].
-        turn: Of the sheet in the photo [deg].
+        turn: Angle by which the sheet is turned in the photo [deg].
         light: How much darker the darkest corner is than the brightest [0..1].
         wobble: How far the pen strays [cell].
-        blur: Standard deviation [pixel].
-        grain: Of the sensor [0..255].
-        seed: Of hand and sensor.
+        blur: Standard deviation of the blur [pixel].
+        grain: Standard deviation of the sensor's noise [0..255].
+        seed: Seed of hand and sensor.
     """
 
     filled: bool = False
@@ -63,11 +63,11 @@ CASTLE = stack_of(
 HOUSE = stack_of((CUBE, -1, 0), (CUBE, 1, 0), (LONG, 0, 1), (RECTANGLE, -0.5, 2), (CUBE, 1, 2), (TRIANGLE, 0, 3))
 
 SHEET = (1188, 840)
-"""Of paper, A4 lying on its side [pixel]."""
+"""Size of the paper, A4 lying on its side [pixel]."""
 
 
 def sheet_with(stack: Stack, photo: Photo, cell: float = 150.0) -> Picture:
-    """(h, w) grey: the front of a stack drawn on a sheet; `cell` is the edge of a cube [pixel]."""
+    """Draw the front of a stack on a sheet, (h, w) grey; `cell` is the edge of a cube [pixel]."""
     rng = np.random.default_rng(photo.seed)
     paper = np.full(SHEET[::-1], 240, dtype=np.uint8)
     middle, ground = SHEET[0] * 0.52, SHEET[1] * 0.5 + 2 * cell
@@ -81,7 +81,7 @@ def sheet_with(stack: Stack, photo: Photo, cell: float = 150.0) -> Picture:
 
 
 def _by_hand(corners: Floats, photo: Photo, cell: float, rng: np.random.Generator) -> Floats:
-    """The outline (n, 2) with a point every tenth of a cell, as a hand draws it."""
+    """Trace the outline (n, 2) with a point every tenth of a cell, as a hand does."""
     pieces = []
     for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         steps = max(2, round(float(np.linalg.norm(end - start)) / (0.1 * cell)))
@@ -93,7 +93,7 @@ def _by_hand(corners: Floats, photo: Photo, cell: float, rng: np.random.Generato
 
 
 def photographed(sheet: Picture, photo: Photo, size: tuple[int, int] = (960, 720)) -> Picture:
-    """(h, w, 3) the sheet on a wooden table."""
+    """Photograph the sheet on a wooden table, (h, w, 3)."""
     rng = np.random.default_rng(photo.seed + 1)
     width, height = size
     table = np.array([120.0, 92.0, 66.0]) * (1 + 0.10 * np.sin(np.arange(height) / 9)[:, None, None])
@@ -112,7 +112,7 @@ def photographed(sheet: Picture, photo: Photo, size: tuple[int, int] = (960, 720
 
 
 def _askew(corners: Floats, photo: Photo, size: tuple[int, int]) -> Floats:
-    """Where the corners of the sheet (4, 2) appear in a photo taken from its lower edge, with the camera turned."""
+    """Find where the corners of the sheet (4, 2) appear in a photo taken from its lower edge with a turned camera."""
     angle, lean = np.radians(photo.turn), 6 * photo.slant
     flat = (corners - corners.mean(axis=0)) / corners[:, 0].max()
     flat = flat @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
@@ -135,7 +135,7 @@ FRAMES = {
 
 
 def main(folder: Path) -> None:
-    """Make them all."""
+    """Make all photos and frames."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, (stack, photo) in SKETCHES.items():
         picture = photographed(sheet_with(stack, photo), photo)

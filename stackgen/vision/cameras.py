@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -120,9 +121,7 @@ def _as_measured(depth: Floats, rig: Rig, rng: np.random.Generator) -> Floats:
 
 def _as_photographed(colours: Floats, rng: np.random.Generator) -> NDArray[np.uint8]:
     """Soften colours (H, W, 3) as a lens does, and add the grain of a sensor."""
-    from scipy import ndimage
-
-    soft = ndimage.gaussian_filter(colours, (0.8, 0.8, 0))
+    soft = cv2.GaussianBlur(colours, (0, 0), 0.8)
     return np.clip(np.round(soft + rng.normal(0, 3, colours.shape)), 0, 255).astype(np.uint8)
 
 
