@@ -5,7 +5,6 @@ https://docs.wandb.ai/guides/sweeps/define-sweep-configuration
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -102,18 +101,9 @@ class Sweep:
             raise StackgenError("a sweep needs parameters, such as {model.draws: {values: [1, 2, 4]}}")
 
     def to_json(self) -> dict[str, Any]:
-        """Plain form, without what was left out: a W&B sweep file again."""
-        return _without_nulls(asdict(self))
+        """Plain form: a W&B sweep file again. What was left out is left out; a parameter's value may be null."""
+        return asdict(self, dict_factory=lambda items: {name: value for name, value in items if value is not None})
 
     def to_yaml(self) -> str:
         """The file for `wandb sweep`."""
         return yaml.safe_dump(self.to_json(), sort_keys=False)
-
-
-def _without_nulls(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Keep what was given, at the top and in the two groups; a parameter's value may be null and stays."""
-    kept = {name: value for name, value in content.items() if value is not None}
-    for name in ("metric", "early_terminate"):
-        if name in kept:
-            kept[name] = {key: value for key, value in kept[name].items() if value is not None}
-    return kept

@@ -5,11 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
+from jsonargparse import Namespace
 from rich.table import Table
 
 from stackgen.errors import StackgenError
@@ -110,28 +111,15 @@ def best_configuration(best: FrozenTrial, sweep: Sweep, folder: Path, trials: in
         key=lambda path: path.stat().st_mtime,
     )
     if not runs:
-        return title + yaml.safe_dump(nested({**constants_of(sweep.parameters), **best.params}), sort_keys=False)
+        values = Namespace()  # dotted names become groups
+        for name, value in {**constants_of(sweep.parameters), **best.params}.items():
+            values[name] = value
+        return title + yaml.safe_dump(values.as_dict(), sort_keys=False)
     config = yaml.safe_load(runs[-1].read_text())
     config["name"] = f"{sweep.name}-best"
     config.pop("ckpt_path", None)
     config["trainer"] |= {"default_root_dir": str(RUNS), "enable_progress_bar": None, "enable_model_summary": None}
     return title + f"#   stackgen fit --config {folder / BEST}\n" + yaml.safe_dump(config, sort_keys=False)
-
-
-def nested(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Turn dotted names into groups.
-
-    >>> nested({"a.b": 1, "a.c": 2, "d": 3})
-    {'a': {'b': 1, 'c': 2}, 'd': 3}
-    """
-    found: dict[str, Any] = {}
-    for name, value in values.items():
-        *groups, last = name.split(".")
-        place = found
-        for group in groups:
-            place = place.setdefault(group, {})
-        place[last] = value
-    return found
 
 
 def write_importance(study: Study, sweep: Sweep, path: Path) -> None:
@@ -141,7 +129,8 @@ def write_importance(study: Study, sweep: Sweep, path: Path) -> None:
 
     pyplot.switch_backend("agg")  # no window, no display
     with pyplot.style.context("default"):  # Optuna sets a style for good
-        plot_param_importances(study, target_name=sweep.metric.name).set(title=sweep.name)
+        axes = plot_param_importances(study, target_name=sweep.metric.name)
+        axes.set_title(f"{sweep.name}: importance of each parameter (PED-ANOVA)", loc="left")
         _save(pyplot.gcf(), path)
         pyplot.close()
 
