@@ -9,12 +9,12 @@ import tempfile
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from stackgen.robot.planning.connection import Connected
 from stackgen.robot.planning.urdf import FINGER_JOINTS, FINGERS, chain_links, self_collision_pairs, with_jaws
 from stackgen.robot.workcell import Workcell
 from stackgen.sim.physics import Physics
@@ -107,7 +107,7 @@ class ArmIndices:
         return next(name for name, number in self.links.items() if number == link)
 
 
-class Clearances:
+class Clearances(Connected):
     """Measures distances in a workcell with blocks.
 
     Args:
@@ -117,19 +117,19 @@ class Clearances:
     """
 
     def __init__(self, workcell: Workcell, stack: Stack, physics: Physics) -> None:
+        super().__init__(bullet.connect(bullet.DIRECT))
         self.workcell, self.stack, self.physics = workcell, stack, physics
-        self._client = bullet.connect(bullet.DIRECT)
-        self._arm = load_arm(workcell, self._client, visual=False)
-        self.indices = ArmIndices.of(self._arm, self._client)
-        slab = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=[2, 2, 0.5], physicsClientId=self._client)
-        self._table = bullet.createMultiBody(0, slab, -1, [0, 0, -0.5], physicsClientId=self._client)
-        molds = [Mold.cast(shape, physics, self._client) for shape in stack.catalogue]
+        self._arm = load_arm(workcell, self.client, visual=False)
+        self.indices = ArmIndices.of(self._arm, self.client)
+        slab = self.bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=[2, 2, 0.5])
+        self._table = self.bullet.createMultiBody(0, slab, -1, [0, 0, -0.5])
+        molds = [Mold.cast(shape, physics, self.client) for shape in stack.catalogue]
         self._blocks = [
-            bullet.createMultiBody(0, molds[shape].collision, -1, [0, 0, -5 - n], physicsClientId=self._client)
+            self.bullet.createMultiBody(0, molds[shape].collision, -1, [0, 0, -5 - n])
             for n, shape in enumerate(stack.shapes)
         ]
         for block, shape in zip(self._blocks, stack.shapes, strict=True):
-            bullet.changeDynamics(block, -1, **molds[shape].dynamics, physicsClientId=self._client)
+            self.bullet.changeDynamics(block, -1, **molds[shape].dynamics)
         links = self.indices.links
         self._pairs = [(links[a], links[b]) for a, b in self_collision_pairs(workcell.arm)]
         self._standing = {links[name] for name in chain_links(workcell.arm)[:2]}  # the arm's foot is at home there
@@ -139,14 +139,14 @@ class Clearances:
         """Put a block at a frame (4, 4)."""
         shape = self.stack.catalogue[int(self.stack.shapes[number])]
         position, quaternion = body_placement(shape, frame, self.physics.cell_size)
-        bullet.resetBasePositionAndOrientation(self._blocks[number], position, quaternion, physicsClientId=self._client)
+        self.bullet.resetBasePositionAndOrientation(self._blocks[number], position, quaternion)
 
     def put_arm(self, joints: Floats, opening: float) -> None:
         """Put the arm at joint angles (n,) [rad], the jaws open to a width [m]."""
         for index, angle in zip(self.indices.arm, joints.tolist(), strict=True):
-            bullet.resetJointState(self._arm, index, angle, physicsClientId=self._client)
+            self.bullet.resetJointState(self._arm, index, angle)
         for index in self.indices.fingers:
-            bullet.resetJointState(self._arm, index, opening / 2, physicsClientId=self._client)
+            self.bullet.resetJointState(self._arm, index, opening / 2)
 
     def of_arm(self, blocks: Iterable[int], touched: int | None = None) -> Near:
         """Least distance of the arm and its jaws from the table, from the arm itself and from some blocks.
@@ -162,9 +162,7 @@ class Clearances:
             skipped = self._fingers if number == touched else set()
             nearest = min(nearest, self._to(self._blocks[number], f"block {number}", skipped))
         for a, b in self._pairs:
-            for point in bullet.getClosestPoints(
-                self._arm, self._arm, SEEN, linkIndexA=a, linkIndexB=b, physicsClientId=self._client
-            ):
+            for point in self.bullet.getClosestPoints(self._arm, self._arm, SEEN, linkIndexA=a, linkIndexB=b):
                 nearest = min(nearest, Near(point[8], f"{self.indices.name(a)} and {self.indices.name(b)}"))
         return nearest
 
@@ -182,7 +180,7 @@ class Clearances:
                 continue
             body = self._table if other == TABLE else self._blocks[other]
             name = "the table" if other == TABLE else f"block {other}"
-            for point in bullet.getClosestPoints(self._blocks[number], body, SEEN, physicsClientId=self._client):
+            for point in self.bullet.getClosestPoints(self._blocks[number], body, SEEN):
                 nearest = min(nearest, Near(point[8], f"block {number} and {name}"))
         return nearest
 
@@ -190,26 +188,12 @@ class Clearances:
         """Find the blocks, and `TABLE`, that a block is within a distance [m] of."""
         bodies = {other: self._blocks[other] for other in others if other != number} | {TABLE: self._table}
         return frozenset(
-            other
-            for other, body in bodies.items()
-            if bullet.getClosestPoints(self._blocks[number], body, within, physicsClientId=self._client)
+            other for other, body in bodies.items() if self.bullet.getClosestPoints(self._blocks[number], body, within)
         )
 
     def _to(self, body: int, name: str, but: Collection[int]) -> Near:
-        points = bullet.getClosestPoints(self._arm, body, SEEN, physicsClientId=self._client)
+        points = self.bullet.getClosestPoints(self._arm, body, SEEN)
         return min(
             (Near(point[8], f"{self.indices.name(point[3])} and {name}") for point in points if point[3] not in but),
             default=Near(),
         )
-
-    def close(self) -> None:
-        """Free the memory of the copy."""
-        if self._client >= 0:
-            bullet.disconnect(self._client)
-            self._client = -1
-
-    def __enter__(self) -> Clearances:
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()

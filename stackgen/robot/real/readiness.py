@@ -25,14 +25,14 @@ def require_ready(host: str) -> None:
         dashboard.connect(_PATIENCE)
     except (RuntimeError, ValueError) as error:
         raise StackgenError(
-            f"no UR controller answers at {host}:{PORT} ({_line(error)}): is the arm switched on, and is the address"
-            " right?"
+            f"no UR controller answers at {host}:{PORT} ({in_a_line(error)}): is the arm switched on, and is the"
+            " address right?"
         ) from error
     try:
         _require_ready(dashboard, host)
     except (RuntimeError, ValueError) as error:  # silence, a closed connection, or what is no text
         raise StackgenError(
-            f"the controller at {host}:{PORT} does not answer as a UR's does: {_line(error)}"
+            f"the controller at {host}:{PORT} does not answer as a UR's does: {in_a_line(error)}"
         ) from error
     finally:
         dashboard.disconnect()
@@ -62,5 +62,6 @@ def _value(answer: str) -> str:
     return answer.rpartition(":")[2].strip().upper()
 
 
-def _line(error: BaseException) -> str:
+def in_a_line(error: BaseException) -> str:
+    """Write what the client says of an error in a line."""
     return " ".join(str(error).split())

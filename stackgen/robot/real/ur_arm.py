@@ -26,7 +26,7 @@ from stackgen.robot.planning.motion import Motion
 from stackgen.robot.planning.plan import BlockPlan
 from stackgen.robot.real.gripper import DigitalJaws, Gripper, RealJaws, RobotiqJaws
 from stackgen.robot.real.program import Controller, Grasps, Move, controller_move, controller_pose, tool_offset
-from stackgen.robot.real.readiness import require_ready
+from stackgen.robot.real.readiness import in_a_line, require_ready
 from stackgen.robot.workcell import Workcell
 
 Floats = NDArray[np.float64]
@@ -88,7 +88,7 @@ class UrArm:
         try:
             self._receive: Any = receive.RTDEReceiveInterface(host, _RATE, list(_VARIABLES))
         except (RuntimeError, ValueError, OSError) as error:
-            raise StackgenError(f"the controller at {host} does not speak RTDE: {_line(error)}") from error
+            raise StackgenError(f"the controller at {host} does not speak RTDE: {in_a_line(error)}") from error
         try:
             self._require_home()
             self._take_control(control)
@@ -193,7 +193,7 @@ class UrArm:
                 and self._control.setWatchdog(_HUNGER)
             )
         except (RuntimeError, ValueError, OSError) as error:
-            raise StackgenError(f"the controller at {self.host} does not take control: {_line(error)}") from error
+            raise StackgenError(f"the controller at {self.host} does not take control: {in_a_line(error)}") from error
         if not fine:
             raise StackgenError(f"the controller at {self.host} refuses tool, payload or watchdog")
 
@@ -222,7 +222,7 @@ class UrArm:
                 raise self._stop_for(f"its own joint angles for the end of a motion ({move.name}) are not the planned")
             return bool(self._control.moveJ(list(solved), move.speed, move.acceleration, True))
         except (RuntimeError, ValueError) as error:
-            raise self._stop_for(f"lost the connection to {self.host}: {_line(error)}") from error
+            raise self._stop_for(f"lost the connection to {self.host}: {in_a_line(error)}") from error
 
     def _follow(self, move: Move) -> None:
         """Watch a motion until the finger tips rest at its end."""
@@ -370,7 +370,3 @@ def _require_port(host: str, port: int) -> None:
         socket.create_connection((host, port), timeout=3.0).close()
     except OSError as error:
         raise StackgenError(f"the controller at {host} does not open port {port}: {error.strerror or error}") from error
-
-
-def _line(error: BaseException) -> str:
-    return " ".join(str(error).split())

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from stackgen.robot.backend import ArmState
 from stackgen.robot.planning.arm_model import arm_model
 from stackgen.robot.planning.clearance import ArmIndices, block_pose, body_placement, load_arm
+from stackgen.robot.planning.connection import Connected
 from stackgen.robot.planning.motion import Motion
 from stackgen.robot.planning.urdf import FINGERS, PALM, chain_links
 from stackgen.robot.workcell import Grasp, Workcell
@@ -62,7 +62,7 @@ class PickNoise:
         return moved
 
 
-class SimulatedArm:
+class SimulatedArm(Connected):
     """A workcell in PyBullet: arm, jaws, table and blocks.
 
     Args:
@@ -85,8 +85,8 @@ class SimulatedArm:
         on_step: Callable[[], None] = lambda: None,
     ) -> None:
         self.workcell, self.stack, self.grasp, self.on_step = workcell, stack, grasp, on_step
+        super().__init__(connect(physics))
         self.physics = physics
-        self.client = connect(physics)
         self.arm = load_arm(workcell, self.client, visual=True)
         self.indices = ArmIndices.of(self.arm, self.client)
         self.fingers = {self.indices.links[name] for name in FINGERS}
@@ -120,7 +120,7 @@ class SimulatedArm:
     def open(self, width: float) -> None:
         """Open the jaws; what a fixed constraint held is let go."""
         if self._constraint is not None:
-            bullet.removeConstraint(self._constraint, physicsClientId=self.client)
+            self.bullet.removeConstraint(self._constraint)
             self._constraint = None
         self._drive_jaws(width / 2, self.workcell.jaws.force)
 
@@ -136,8 +136,8 @@ class SimulatedArm:
 
     def state(self) -> ArmState:
         """Tell where arm and jaws are in the simulation."""
-        states = bullet.getJointStates(self.arm, self.indices.arm, physicsClientId=self.client)
-        jaws = bullet.getJointStates(self.arm, self.indices.fingers, physicsClientId=self.client)
+        states = self.bullet.getJointStates(self.arm, self.indices.arm)
+        jaws = self.bullet.getJointStates(self.arm, self.indices.fingers)
         return ArmState(np.array([state[0] for state in states]), sum(state[0] for state in jaws))
 
     def stop(self) -> None:
@@ -152,7 +152,7 @@ class SimulatedArm:
     def frame(self, block: int) -> Floats:
         """Frame (4, 4) of a block in the table frame."""
         shape = self.stack.catalogue[int(self.stack.shapes[block])]
-        position, quaternion = bullet.getBasePositionAndOrientation(self.blocks[block], physicsClientId=self.client)
+        position, quaternion = self.bullet.getBasePositionAndOrientation(self.blocks[block])
         frame = np.eye(4)
         frame[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
         frame[:3, 3] = position - frame[:3, :3] @ (shape.center_of_mass * self.physics.cell_size)
@@ -167,7 +167,7 @@ class SimulatedArm:
         """Find what touches what right now: (`arm`, link, block) and (`block`, block, other block)."""
         numbers = {body: number for number, body in enumerate(self.blocks)}
         found = set()
-        for point in bullet.getContactPoints(physicsClientId=self.client):
+        for point in self.bullet.getContactPoints():
             a, b, link_a, link_b, distance, force = point[1], point[2], point[3], point[4], point[8], point[9]
             if distance > 0 or force < 1e-3:
                 continue
@@ -181,35 +181,17 @@ class SimulatedArm:
                 found.add(("arm", link_a if a == self.arm else link_b, -1))
         return found
 
-    def close_world(self) -> None:
-        """Free the memory of the simulation."""
-        if self.client >= 0:
-            bullet.disconnect(self.client)
-            self.client = -1
-
-    def __enter__(self) -> SimulatedArm:
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close_world()
-
     def _spawn(self, shape: Shape, index: int, frame: Floats) -> int:
         """A block with the physics of the verdicts and a colour for the camera."""
         mold = Mold.cast(shape, self.physics, self.client)
         visual = block_visual(shape, index, self.physics.cell_size, self.client)
         position, quaternion = body_placement(shape, frame, self.physics.cell_size)
-        body = bullet.createMultiBody(
-            mold.mass, mold.collision, visual, position, quaternion, physicsClientId=self.client
-        )
+        body = self.bullet.createMultiBody(mold.mass, mold.collision, visual, position, quaternion)
         # Without the anchor a stack at rest creeps by a millimetre in a few seconds, as nothing real does (a
         # verdict's watch is too short to notice); what has come to rest sleeps, until touched: half of the time.
-        bullet.changeDynamics(body, -1, **mold.dynamics, frictionAnchor=1, physicsClientId=self.client)
-        bullet.changeDynamics(
-            body,
-            -1,
-            activationState=bullet.ACTIVATION_STATE_ENABLE_SLEEPING,
-            sleepThreshold=_ASLEEP,
-            physicsClientId=self.client,
+        self.bullet.changeDynamics(body, -1, **mold.dynamics, frictionAnchor=1)
+        self.bullet.changeDynamics(
+            body, -1, activationState=bullet.ACTIVATION_STATE_ENABLE_SLEEPING, sleepThreshold=_ASLEEP
         )
         return int(body)
 
@@ -218,21 +200,18 @@ class SimulatedArm:
         home = self.workcell.home_joints
         self._efforts = arm_model(self.workcell.arm).effort.tolist()
         for index, angle in zip(self.indices.arm, home.tolist(), strict=True):
-            bullet.resetJointState(self.arm, index, angle, physicsClientId=self.client)
+            self.bullet.resetJointState(self.arm, index, angle)
         for index in self.indices.fingers:
-            bullet.resetJointState(self.arm, index, self.workcell.jaws.opening / 2, physicsClientId=self.client)
-            bullet.changeDynamics(
-                self.arm, index, lateralFriction=self.workcell.jaws.friction, physicsClientId=self.client
-            )
+            self.bullet.resetJointState(self.arm, index, self.workcell.jaws.opening / 2)
+            self.bullet.changeDynamics(self.arm, index, lateralFriction=self.workcell.jaws.friction)
         left, right = self.indices.fingers
-        gear = bullet.createConstraint(
-            self.arm, left, self.arm, right, bullet.JOINT_GEAR, [0, 1, 0], [0, 0, 0], [0, 0, 0],
-            physicsClientId=self.client,
-        )  # fmt: skip
-        bullet.changeConstraint(gear, gearRatio=-1, maxForce=10_000, erp=0.3, physicsClientId=self.client)
+        gear = self.bullet.createConstraint(
+            self.arm, left, self.arm, right, bullet.JOINT_GEAR, [0, 1, 0], [0, 0, 0], [0, 0, 0]
+        )
+        self.bullet.changeConstraint(gear, gearRatio=-1, maxForce=10_000, erp=0.3)
         for name in chain_links(self.workcell.arm)[:2]:
             link = self.indices.links[name]
-            bullet.setCollisionFilterPair(self.arm, 0, link, -1, 0, physicsClientId=self.client)
+            self.bullet.setCollisionFilterPair(self.arm, 0, link, -1, 0)
         self._hold_at(home)
         self._drive_jaws(self.workcell.jaws.opening / 2, self.workcell.jaws.force)
         self.steps = 0
@@ -241,7 +220,7 @@ class SimulatedArm:
         self._command(joints.tolist(), [0.0] * len(joints))
 
     def _command(self, positions: list[float], velocities: list[float]) -> None:
-        bullet.setJointMotorControlArray(
+        self.bullet.setJointMotorControlArray(
             self.arm,
             self.indices.arm,
             bullet.POSITION_CONTROL,
@@ -250,26 +229,24 @@ class SimulatedArm:
             forces=self._efforts,
             positionGains=[0.6] * len(positions),
             velocityGains=[1.0] * len(positions),
-            physicsClientId=self.client,
         )
 
     def _drive_jaws(self, half: float, force: float) -> None:
         """Move the fingers until they rest; each presses with half of the force."""
         for index in self.indices.fingers:
-            bullet.setJointMotorControl2(
-                self.arm, index, bullet.POSITION_CONTROL, half, force=force / 2, maxVelocity=_JAW_SPEED,
-                physicsClientId=self.client,
-            )  # fmt: skip
+            self.bullet.setJointMotorControl2(
+                self.arm, index, bullet.POSITION_CONTROL, half, force=force / 2, maxVelocity=_JAW_SPEED
+            )
         for step in range(round(_JAW_TIME / self.physics.time_step)):
             self._step()
-            speeds = bullet.getJointStates(self.arm, self.indices.fingers, physicsClientId=self.client)
+            speeds = self.bullet.getJointStates(self.arm, self.indices.fingers)
             if step > 24 and max(abs(state[1]) for state in speeds) < 5e-4:
                 return
 
     def _between_fingers(self) -> int | None:
         """Find the block at the finger tips; None where there is none."""
         link = self.indices.links[PALM]
-        state = bullet.getLinkState(self.arm, link, computeForwardKinematics=1, physicsClientId=self.client)
+        state = self.bullet.getLinkState(self.arm, link, computeForwardKinematics=1)
         down = Rotation.from_quat(state[5]).as_matrix()[:, 2]
         tip = np.array(state[4]) + down * self.workcell.jaws.reach
         reach = 0.8 * self.physics.cell_size
@@ -280,24 +257,23 @@ class SimulatedArm:
     def _fix(self, block: int) -> None:
         """Put a fixed constraint between palm and block, as they are."""
         link = self.indices.links[PALM]
-        state = bullet.getLinkState(self.arm, link, computeForwardKinematics=1, physicsClientId=self.client)
+        state = self.bullet.getLinkState(self.arm, link, computeForwardKinematics=1)
         back = bullet.invertTransform(state[0], state[1])
-        there = bullet.getBasePositionAndOrientation(block, physicsClientId=self.client)
+        there = self.bullet.getBasePositionAndOrientation(block)
         position, quaternion = bullet.multiplyTransforms(*back, *there)
-        self._constraint = bullet.createConstraint(
-            self.arm, link, block, -1, bullet.JOINT_FIXED, [0, 0, 0], position, [0, 0, 0], quaternion,
-            physicsClientId=self.client,
-        )  # fmt: skip
-        bullet.changeConstraint(self._constraint, maxForce=500, physicsClientId=self.client)
+        self._constraint = self.bullet.createConstraint(
+            self.arm, link, block, -1, bullet.JOINT_FIXED, [0, 0, 0], position, [0, 0, 0], quaternion
+        )
+        self.bullet.changeConstraint(self._constraint, maxForce=500)
 
     def _measure(self, wanted: list[float]) -> None:
-        states = bullet.getJointStates(self.arm, self.indices.arm, physicsClientId=self.client)
+        states = self.bullet.getJointStates(self.arm, self.indices.arm)
         error = max(abs(state[0] - angle) for state, angle in zip(states, wanted, strict=True))
         self.tracking_error = max(self.tracking_error, error)
         self.torque = np.maximum(self.torque, [abs(state[3]) for state in states])
 
     def _step(self) -> None:
-        bullet.stepSimulation(physicsClientId=self.client)
+        self.bullet.stepSimulation()
         self.steps += 1
         self.on_step()
 

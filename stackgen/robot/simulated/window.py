@@ -5,10 +5,10 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from types import TracebackType
 
 from stackgen.errors import StackgenError
 from stackgen.robot.planning.clearance import load_arm
+from stackgen.robot.planning.connection import Connected
 from stackgen.robot.simulated.arm import SimulatedArm, block_visual
 from stackgen.sim.simulator import bullet, connect
 
@@ -16,7 +16,7 @@ RATE = 25.0
 """Pictures in a simulated second."""
 
 
-class Window:
+class Window(Connected):
     """Shows an arm and its blocks while they move; closing it does not stop the build.
 
     Args:
@@ -30,15 +30,15 @@ class Window:
     def __init__(self, arm: SimulatedArm, mode: int = bullet.GUI) -> None:
         if mode == bullet.GUI:
             require_display()
+        super().__init__(connect(arm.physics, mode))
         self.arm = arm
-        self.client = connect(arm.physics, mode)
         # Drawing waits until everything is loaded: with a software renderer every mesh would take a minute.
         for switch in (bullet.COV_ENABLE_GUI, bullet.COV_ENABLE_SHADOWS, bullet.COV_ENABLE_RENDERING):
-            bullet.configureDebugVisualizer(switch, 0, physicsClientId=self.client)
-        bullet.resetDebugVisualizerCamera(1.1, 20, -25, [0, 0.05, 0.15], physicsClientId=self.client)
+            self.bullet.configureDebugVisualizer(switch, 0)
+        self.bullet.resetDebugVisualizerCamera(1.1, 20, -25, [0, 0.05, 0.15])
         self.body = load_arm(arm.workcell, self.client, visual=True)
         self.blocks = [self._block(number) for number in range(len(arm.stack))]
-        bullet.configureDebugVisualizer(bullet.COV_ENABLE_RENDERING, 1, physicsClientId=self.client)
+        self.bullet.configureDebugVisualizer(bullet.COV_ENABLE_RENDERING, 1)
         self._every = max(1, round(1 / RATE / arm.physics.time_step))
         self.show()
 
@@ -52,33 +52,21 @@ class Window:
         if self.client < 0:
             return
         try:
-            joints = range(bullet.getNumJoints(self.body, physicsClientId=self.client))
-            states = bullet.getJointStates(self.arm.arm, joints, physicsClientId=self.arm.client)
+            joints = range(self.bullet.getNumJoints(self.body))
+            states = self.arm.bullet.getJointStates(self.arm.arm, joints)
             for joint, state in zip(joints, states, strict=True):
-                bullet.resetJointState(self.body, joint, state[0], physicsClientId=self.client)
+                self.bullet.resetJointState(self.body, joint, state[0])
             for ours, theirs in zip(self.blocks, self.arm.blocks, strict=True):
-                place = bullet.getBasePositionAndOrientation(theirs, physicsClientId=self.arm.client)
-                bullet.resetBasePositionAndOrientation(ours, *place, physicsClientId=self.client)
+                place = self.arm.bullet.getBasePositionAndOrientation(theirs)
+                self.bullet.resetBasePositionAndOrientation(ours, *place)
         except bullet.error:  # the window was closed
             self.client = -1
-
-    def close(self) -> None:
-        """Close it, if it is open."""
-        if self.client >= 0 and bullet.isConnected(self.client):
-            bullet.disconnect(self.client)
-        self.client = -1
-
-    def __enter__(self) -> Window:
-        return self
-
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close()
 
     def _block(self, number: int) -> int:
         stack = self.arm.stack
         shape = int(stack.shapes[number])
         visual = block_visual(stack.catalogue[shape], shape, self.arm.physics.cell_size, self.client)
-        return int(bullet.createMultiBody(0, -1, visual, physicsClientId=self.client))
+        return int(self.bullet.createMultiBody(0, -1, visual))
 
 
 def require_display() -> None:
