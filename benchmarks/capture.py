@@ -53,7 +53,7 @@ def parser() -> argparse.ArgumentParser:
     options = argument_parser(__name__, __doc__)
     options.add_argument("--number", type=int, default=100, help="number of stacks")
     options.add_argument(
-        "--seed", type=int, default=0, help="seed of the draw, the cameras, their noise and the samples"
+        "--seed", type=int, default=0, help="seed of the draw, the cameras, their noise and samples"
     )
     return options
 

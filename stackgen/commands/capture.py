@@ -13,7 +13,6 @@ from stackgen.commands.parsing import Command
 from stackgen.errors import StackgenError
 from stackgen.geometry import iou
 from stackgen.geometry import silhouette as silhouette_of
-from stackgen.io.files import write_atomically
 from stackgen.io.stacks_file import read_stacks
 from stackgen.stack import format_block_list
 from stackgen.vision.cameras import Rig, realsense_frame, simulated_frame
@@ -21,6 +20,7 @@ from stackgen.vision.cells import Ints
 from stackgen.vision.depth import DepthFrame, Floats, Picture, find_structure, read_frame
 from stackgen.vision.drawings import read_silhouette
 from stackgen.vision.sketches import read_sketch
+from stackgen.viz.render import save_image
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Mask
 
 _RED = (214, 39, 40)
@@ -63,7 +63,7 @@ def main(
     """Find the silhouette of a structure before a depth camera, or in the photo of a drawing.
 
     Args:
-        out: PNG to write the silhouette to; `stackgen sample` takes it.
+        out: PNG file to write the silhouette to; `stackgen sample` takes it.
         depth: Depth frame: a 16-bit PNG in mm, or a .npy in m.
         color: Picture of the same pixels as --depth, for the overlay.
         sketch: Photo of a drawing on paper, filled or in outline.
@@ -74,7 +74,7 @@ def main(
         azimuth: Angle of the simulated camera to the right of the front [deg].
         seed: Seed of the simulated camera's noise.
         truth: Picture of the structure, with which the silhouette is compared.
-        overlay: PNG to write the picture with what was found to; by default it lies beside the silhouette.
+        overlay: PNG or JPEG file to write the picture with what was found to; by default it lies beside the silhouette.
     """
     if sum([bool(depth), bool(sketch), bool(simulate), realsense]) != 1:
         raise StackgenError("give one of --depth FILE, --sketch PHOTO, --simulate STACKS and --realsense")
@@ -173,8 +173,8 @@ def _beside(picture: Picture, silhouette: Mask) -> Picture:
 
 def _write(result: _Result, out: Path, overlay: Path) -> None:
     """Write both pictures, and print what was found."""
-    for path, picture in ((out, result.silhouette.astype(np.uint8) * 255), (overlay, result.overlay[..., ::-1])):
-        write_atomically(path, bytes(cv2.imencode(".png", picture)[1]))
+    save_image(out, result.silhouette)
+    save_image(overlay, result.overlay)
     print(*result.lines, f"wrote {out}", f"wrote {overlay}", sep="\n")
 
 
