@@ -26,7 +26,7 @@ from stackgen.errors import StackgenError
 from stackgen.evaluation.intervals import clustered_ratio
 from stackgen.sim.checkers import AcceptLimits, accept, fell
 from stackgen.sim.simulator import Rollout, Simulator
-from stackgen.sim.statics.plane import StaticsMargins, Outcome
+from stackgen.sim.statics.plane import Outcome, StaticsMargins
 from stackgen.stack import Stack
 from stackgen.world import PAPER_WORLD
 

@@ -156,9 +156,9 @@ def reader(options: argparse.Namespace, path: str) -> tuple[int, Callable[[], in
         arrays = dataset.split("train")
         loader = CachedLoader(arrays, options.batch_size, train=True, **PATHS[path])
     elif kind == "stream":
-        loader = TrainingStream(Dataset.open(dataset), options.batch_size, **PATHS[path])
+        loader = TrainingStream(dataset, options.batch_size, **PATHS[path])
     else:
-        loader = ExactStream(Dataset.open(dataset), "train", options.batch_size, **PATHS[path])
+        loader = ExactStream(dataset, "train", options.batch_size, **PATHS[path])
     return count, lambda: sum(len(batch["template"]) for batch in loader)
 
 

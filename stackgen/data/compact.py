@@ -18,7 +18,7 @@ from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
 
 
-def save_npz(path: str | Path, splits: Mapping[str, StackArrays], manifest: Manifest) -> None:
+def save_npz(path: str | Path, splits: Mapping[Any, StackArrays], manifest: Manifest) -> None:
     """Write a whole dataset as one compressed file of plain arrays.
 
     Args:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stackgen.sim.checkers import AcceptLimits, accept
 from stackgen.sim.simulator import Simulator
-from stackgen.sim.statics.plane import StaticsMargins, Outcome, PlaneStatics
+from stackgen.sim.statics.plane import Outcome, PlaneStatics, StaticsMargins
 from stackgen.stack import Stack
 
 NEVER = StaticsMargins(enabled=False)
