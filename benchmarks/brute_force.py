@@ -1,6 +1,6 @@
 """Brute force over the frozen test scenes with both block lists, and the naive loop over a few of them.
 
-The searches alone: prediction of the lists and judging are left out. Seconds are those of the clock and of the
+The searches alone: prediction of the lists and simulation are left out. Seconds are those of the clock and of the
 processor; on a busy machine the latter are the ones to compare.
 """
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.baselines.brute_force import BruteForce
 from stackgen.baselines.heuristic import random_stream
-from stackgen.data.datamodule import TESTSET
+from stackgen.data.dataset import TESTSET
 from stackgen.evaluation.protocol import Scene, load_scenes
 from stackgen.world import Mask
 from tests.baselines.naive import naive_search
@@ -57,7 +57,7 @@ def main() -> None:
 
 def block_lists(scenes: Sequence[Scene], weights: str) -> dict[str, NDArray[np.int64]]:
     """(B, S) the true lists and the network's most likely ones."""
-    from stackgen.models.weights import load_predictor
+    from stackgen.sampling.methods import load_predictor
 
     pictures = np.stack([scene.silhouette for scene in scenes])
     parts = [

@@ -1,8 +1,9 @@
-"""How diverse valid samples can be: all layouts of a block list that fill a silhouette and stand, counted.
+"""The diversity limit: all layouts of a block list that fill a silhouette and stand, counted.
 
 For scenes of testset-v1, evenly spread, with the true block list and with the CNN's. The search is exact
 (stackgen.evaluation.diversity_limit); a layout stands if PyBullet says so of one of its placements. How often the
-scene's own layout is found to stand tells how complete that is: it did stand when the scene was made.
+scene's own layout is found to stand tells how complete that is: it did stand when the scene was made. The report takes
+the file from the package, where it is written by default.
 """
 
 from __future__ import annotations
@@ -20,21 +21,21 @@ from numpy.typing import NDArray
 from rich.progress import track
 
 from benchmarks.common import argument_parser, plain_table, report, start
-from stackgen.data.generation.deconstruction import surely_falls
 from stackgen.data.dataset import TESTSET
+from stackgen.data.generation.deconstruction import surely_falls
 from stackgen.errors import StackgenError
 from stackgen.evaluation.diversity_limit import PLACEMENTS, Answers, answers, expected_diversity
 from stackgen.evaluation.intervals import Estimate, clustered_ratio
 from stackgen.evaluation.protocol import Scene, load_scenes
-from stackgen.evaluation.report.known import format_layout
+from stackgen.evaluation.report.references import LIMIT_FILE, format_layout
 from stackgen.evaluation.results import PREDICTED_LIST, TRUE_LIST
-from stackgen.models.weights import resolve_weights
-from stackgen.protocols import Verdict
+from stackgen.protocols import StabilityChecker, Verdict
 from stackgen.sampling.feasible import layout
 from stackgen.sampling.methods import load_predictor
 from stackgen.sim.checkers import SimulatorChecker
+from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
-from stackgen.world import PAPER_GRID
+from stackgen.world import PAPER_GRID, PAPER_WORLD
 
 SAMPLES = 3
 """Of the protocol."""
@@ -45,6 +46,7 @@ Counts = NDArray[np.int64]
 def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
+    options.set_defaults(out=LIMIT_FILE)
     options.add_argument("--scenes", type=int, default=500, help="how many, evenly spread over the test set")
     options.add_argument("--placements", type=int, default=PLACEMENTS, help="displaced placements to try of a design")
     options.add_argument("--block_list_weights", default="default", help="the network that predicts the other list")
@@ -57,36 +59,40 @@ def main() -> None:
     options = parser().parse_args()
     if min(options.scenes, options.workers) < 1 or options.placements < 0:
         raise StackgenError("--scenes and --workers must be at least 1, --placements at least 0")
-    everything, manifest = load_scenes(TESTSET)
+    everything, dataset = load_scenes(TESTSET)
     number = min(options.scenes, len(everything))
     scenes = [everything[i] for i in np.linspace(0, len(everything) - 1, number).round().astype(int)]
-    predictor = load_predictor(resolve_weights(options.block_list_weights))
+    predictor = load_predictor(options.block_list_weights)
     predicted = predictor.predict(np.stack([scene.silhouette for scene in scenes]), top=1)[:, 0]
     lists = {TRUE_LIST: [scene.counts for scene in scenes], PREDICTED_LIST: list(predicted)}
     figures: dict[str, Any] = {
-        "test_set": manifest.sha256,
+        "test_set": dataset.manifest.sha256,
         "physics": StaticsFirst().physics.to_json(),
         "samples": SAMPLES,
         "placements": options.placements,
-        "block_list_weights": getattr(predictor, "card", {}).get("sha256"),
+        "block_list_weights": predictor.card.get("sha256"),
         "lists": {},
     }
     for source, counts in lists.items():
         began = time.perf_counter()
         found = list(search(scenes, counts, options.placements, options.workers, source))
         figures["lists"][source] = {**summary(scenes, counts, found), "seconds": time.perf_counter() - began}
-    report("diversity_ceiling", figures, tables(figures), options.out)
+    report("diversity_limit", figures, tables(figures), options.out)
 
 
-class StaticsFirst:
+class StaticsFirst(StabilityChecker):
     """PyBullet, unless a block hangs in the air or beside its support: then it need not be asked."""
 
     def __init__(self) -> None:
         self.simulator = SimulatorChecker(until_fall=True)
-        self.physics = self.simulator.physics
+
+    @property
+    def physics(self) -> Physics:
+        """The simulator's."""
+        return self.simulator.physics
 
     def check(self, stack: Stack) -> Verdict:
-        """Judge one stack."""
+        """Give the verdict on one stack."""
         if not surely_falls(stack):
             return self.simulator.check(stack)
         return Verdict(False, np.ones(len(stack), dtype=bool), np.ones(len(stack)), stack)
@@ -99,7 +105,7 @@ def _answers(job: tuple[Scene, Counts], placements: int) -> Answers:
     """The layouts of one scene, by this process's own simulator."""
     global _checker
     _checker = _checker or StaticsFirst()
-    return answers(job[0].silhouette, job[1], _checker, placements=placements)
+    return answers(job[0].silhouette, job[1], _checker, PAPER_WORLD, placements)
 
 
 def search(
@@ -121,7 +127,7 @@ def summary(scenes: Sequence[Scene], counts: Sequence[Counts], found: Sequence[A
     own = [(layout(scene.truth, PAPER_GRID), some) for scene, list_, some in zip(scenes, counts, found, strict=True)
            if scene.truth is not None and np.array_equal(list_, scene.counts)]  # fmt: skip
     shares = {
-        "ceiling": clustered_ratio([expected_diversity(number, SAMPLES) for number in valid], ones),
+        "diversity_limit": clustered_ratio([expected_diversity(number, SAMPLES) for number in valid], ones),
         "most_possible": clustered_ratio(np.minimum(valid, SAMPLES) / SAMPLES, ones),
         "matching_layouts": clustered_ratio([len(some.matching) for some in found], ones),
         "valid_layouts": clustered_ratio(valid, ones),

@@ -8,7 +8,6 @@ CNN's block list, the silhouette shifted to the grid's cells. Front IoU is with 
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,12 +18,12 @@ from scipy import ndimage
 from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette
-from stackgen.io.files import write_atomically
+from stackgen.io.files import write_json
 from stackgen.protocols import StabilityChecker, StackSampler
 from stackgen.sampling.alignment import AlignedSampler
 from stackgen.stack import Stack
 from stackgen.vision.drawings import grid_offset
-from stackgen.world import PAPER_GRID, Grid, Mask
+from stackgen.world import PAPER_GRID, Mask, World
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -160,7 +159,7 @@ def half_cell_steps(truth: Stack, checker: StabilityChecker, rng: np.random.Gene
             poses = truth.poses.copy()
             poses[np.round(poses[:, 2] - 0.5) >= level, 0] += side
             verdict = checker.check(truth.with_poses(poses))
-            cut_off = silhouette(verdict.settled)[:, [0, -1]].any()
+            cut_off = silhouette(verdict.settled, PAPER_GRID)[:, [0, -1]].any()
             if verdict.stable and verdict.at_rest and not cut_off:
                 return verdict.settled
     return None
@@ -176,14 +175,14 @@ def scenes_of_kind(kind: str, scenes: Sequence[Scene], checker: StabilityChecker
     if kind == EXAMPLES:
         files = sorted(DRAWINGS.iterdir())
         unknown = np.zeros_like(scenes[0].counts)
-        return [Scene(file.stem, read_silhouette(file), unknown) for file in files]
+        return [Scene(file.stem, read_silhouette(file, PAPER_GRID), unknown) for file in files]
     found = []
     for number, scene in enumerate(scenes):
         rng = np.random.default_rng([seed, KINDS.index(kind), number])
         if kind == HALF_CELLS:
             moved = half_cell_steps(scene.truth, checker, rng) if scene.truth else None
             if moved is not None:
-                found.append(Scene(scene.name, silhouette(moved), scene.counts, moved))
+                found.append(Scene(scene.name, silhouette(moved, PAPER_GRID), scene.counts, moved))
         else:
             mask = disturbed(scene.silhouette, DISTURBANCES[kind], rng, centre=not kind.startswith("shifted"))
             found += [] if mask is None else [replace(scene, silhouette=mask, truth=None)]
@@ -191,31 +190,36 @@ def scenes_of_kind(kind: str, scenes: Sequence[Scene], checker: StabilityChecker
 
 
 class AlignedPredictor:
-    """A BlockListPredictor that shows another each structure on the cells of its grid.
+    """A BlockListPredictor that shows another each structure on the cells of its grid."""
 
-    Args:
-        predictor: The other.
-        grid: Scale of the silhouettes.
-    """
+    def __init__(self, predictor: BlockListPredictor) -> None:
+        self.predictor = predictor
 
-    def __init__(self, predictor: BlockListPredictor, grid: Grid = PAPER_GRID) -> None:
-        self.predictor, self.grid = predictor, grid
+    @property
+    def world(self) -> World:
+        """The world of the other predictor."""
+        return self.predictor.world
+
+    @property
+    def card(self) -> Mapping[str, Any]:
+        """The card of the other predictor."""
+        return self.predictor.card
 
     def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """See BlockListPredictor."""
-        shifted = [np.roll(mask, grid_offset(mask, self.grid), axis=1) for mask in silhouettes]
+        shifted = [np.roll(mask, grid_offset(mask, self.world.grid), axis=1) for mask in silhouettes]
         return self.predictor.predict(np.stack(shifted), top, limit)
 
 
 def methods_of(options: argparse.Namespace, checker: StabilityChecker) -> dict[str, StackSampler]:
-    """Whom to ask, by name."""
-    from stackgen.models.weights import load_sampler, resolve_weights
+    """The methods to ask, by name."""
+    from stackgen.sampling.methods import load_sampler
     from stackgen.sampling.verified import Budget, VerifiedSampler
 
     methods: dict[str, StackSampler] = {}
     for name in options.weights:
-        sampler = load_sampler(resolve_weights(name))
-        title = getattr(sampler, "card", {}).get("name", name)
+        sampler = load_sampler(name)
+        title = str(sampler.card.get("name", name))
         methods[title] = AlignedSampler(sampler)
     if options.verified:
         methods[f"{title}, verified"] = VerifiedSampler(methods[title], checker, Budget(options.draws))
@@ -223,24 +227,23 @@ def methods_of(options: argparse.Namespace, checker: StabilityChecker) -> dict[s
 
 
 def main() -> None:
-    """Disturb, ask, judge."""
+    """Disturb the silhouettes, ask the methods, check their stacks."""
     options = parser().parse_args()
     if min(options.scenes, options.num_samples) < 1:
         raise StackgenError("--scenes and --num_samples must be at least 1")
-    from stackgen.data.generation.generate import TESTSET
-    from stackgen.data.shards import manifest_sha256
-    from stackgen.evaluation.protocol import evaluate, load_scenes, physics_of
-    from stackgen.models.weights import load_predictor
+    from stackgen.data.dataset import TESTSET
+    from stackgen.evaluation.protocol import Request, evaluate, load_scenes, physics_of
+    from stackgen.sampling.methods import load_predictor
     from stackgen.sim.checkers import SimulatorChecker
 
-    everything, manifest = load_scenes(TESTSET)
+    everything, dataset = load_scenes(TESTSET)
     number = min(options.scenes, len(everything))
     scenes = [everything[i] for i in np.linspace(0, len(everything) - 1, number).round().astype(int)]
     checker, predictor = SimulatorChecker(until_fall=True), AlignedPredictor(load_predictor("default"))
     methods = methods_of(options, checker)
     rows: list[dict[str, Any]] = []
     figures = {
-        "test_set": manifest_sha256(manifest),
+        "test_set": dataset.manifest.sha256,
         "samples_per_scene": options.num_samples,
         "seed": options.seed,
         "physics": physics_of(checker),
@@ -249,14 +252,17 @@ def main() -> None:
     for kind in options.kinds:
         asked = scenes_of_kind(kind, scenes, checker, options.seed)
         for name, sampler in methods.items():
-            found = evaluate(sampler, asked, checker, options.num_samples, options.seed, predictor)
+            request = Request(
+                name, sampler.world, sampler, predictor, num_samples=options.num_samples, seed=options.seed
+            )
+            found = evaluate(request, asked, checker)
             estimates = {metric: found.estimate(metric) for metric in METRICS}
             rows.append({"silhouettes": kind, "scenes": len(asked), "method": name}
                         | {metric: value and value.to_json() for metric, value in estimates.items()})  # fmt: skip
             print(f"{kind}, {name}: " + ", ".join(f"{m} {_percent(rows[-1][m])}" for m in METRICS), flush=True)
             if options.out is not None:
                 options.out.parent.mkdir(parents=True, exist_ok=True)
-                write_atomically(options.out, (json.dumps(figures, indent=1) + "\n").encode())
+                write_json(options.out, figures)
     report("out_of_distribution", figures, [table(rows, metric) for metric in METRICS[:2]], options.out)
 
 

@@ -1,8 +1,8 @@
 """Quality against steps, what verified sampling adds, and what both cost, on validation scenes with their true lists.
 
-Three tables: each kind of sampler at some numbers of steps; autoguidance, where a weaker model is named;
-verified sampling with both judges. Intervals are 95 %, clustered by scene. The time is that of one silhouette's samples
-alone, warm; of verified sampling with the judge. Each row is printed and written when it is there.
+Two tables: each kind of sampler at some numbers of steps, and verified sampling with both checkers. Intervals are
+95 %, clustered by scene. The time is that of one silhouette's samples alone, warm; verified sampling is timed with its
+checker. Each row is printed and written when it is there.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_json
 from stackgen.models.diffusion.settings import SamplerConfig
-from stackgen.protocols import Judge
+from stackgen.protocols import CheckerName
 
 KINDS = {
     "ddpm": SamplerConfig("ddpm"),
@@ -29,7 +29,7 @@ KINDS = {
     "dpm": SamplerConfig("dpm"),
     "dpm-sde": SamplerConfig("dpm", eta=1.0),
 }
-TABLES = ("steps", "guidance", "verified")
+TABLES = ("steps", "verified")
 METRICS = ("stability", "front_iou", "iou_given_stable", "valid_diversity")
 
 
@@ -38,15 +38,15 @@ class Row:
     """What is measured.
 
     Args:
-        table, name: Where it stands.
-        sampler: Its settings.
-        verify: The judge, for verified sampling.
+        table, name: Table and line that it stands in.
+        sampler: Settings of the sampler.
+        verify: Checker of verified sampling; None for single samples.
     """
 
     table: str
     name: str
     sampler: SamplerConfig
-    verify: Judge | None = None
+    verify: CheckerName | None = None
 
 
 def parser() -> argparse.ArgumentParser:
@@ -61,19 +61,14 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--kinds", nargs="+", choices=list(KINDS), default=["ddpm", "ddim", "dpm"], help="of samplers")
     options.add_argument("--steps", nargs="+", type=int, default=[50, 25, 16, 10, 8, 5, 4], help="calls of the network")
     options.add_argument("--spacing", type=float, default=None, help="of the steps, see SamplerConfig")
-    options.add_argument("--guide", help="weights of a weaker version of the model, for the table of guidance")
-    options.add_argument("--judge", choices=("simulator", "statics"), default="simulator", help="of the figures")
+    options.add_argument("--checker", choices=get_args(CheckerName), default="simulator", help="which stacks stand")
     options.add_argument("--draws", type=int, default=64, help="of a scene, at most, for verified sampling")
     options.add_argument("--runs", type=int, default=10, help="timed calls a row")
     return options
 
 
 def rows_of(options: argparse.Namespace) -> list[Row]:
-    """What the options ask for.
-
-    Raises:
-        StackgenError: If guidance has no guide.
-    """
+    """What the options ask for."""
     rows = []
     fast = SamplerConfig("ddpm", 8, options.spacing)
     if "steps" in options.tables:
@@ -81,16 +76,9 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
             for steps in options.steps:
                 settings = KINDS[kind].over(SamplerConfig(steps=steps, spacing=options.spacing))
                 rows.append(Row("steps", f"{kind} {steps}", settings))
-    if "guidance" in options.tables:
-        if options.guide is None:
-            raise StackgenError("the table of guidance needs --guide, weights of a weaker version of the model")
-        for weight in (1.0, 1.25, 1.5, 2.0):
-            for guided in ((0.0, 1.0), (0.3, 1.0)) if weight > 1 else ((0.0, 1.0),):
-                settings = SamplerConfig(guide=options.guide, guidance=weight, guided=guided).over(fast)
-                rows.append(Row("guidance", f"weight {weight}, t/T from {guided[0]}", settings))
     if "verified" in options.tables:
         rows.append(Row("verified", "single samples", fast))
-        rows += [Row("verified", judge, fast, judge) for judge in get_args(Judge)]
+        rows += [Row("verified", checker, fast, checker) for checker in get_args(CheckerName)]
     return rows
 
 
@@ -106,18 +94,18 @@ def main() -> None:
     loaded: Any = load_sampler(options.weights)
     if not hasattr(loaded, "configured"):
         raise StackgenError(f"{options.weights} is no diffusion model")
-    scenes, manifest = load_scenes(options.data, "validation")
+    scenes, dataset = load_scenes(options.data, "validation")
     chosen = np.random.default_rng(options.seed).choice(len(scenes), min(options.scenes, len(scenes)), replace=False)
     scenes = [scenes[i] for i in sorted(chosen)]
-    checker = SimulatorChecker(catalogue=loaded.catalogue, until_fall=True)
+    checker = SimulatorChecker(until_fall=True)
     figures: dict[str, Any] = {
         "weights": loaded.card.get("name", options.weights),
         "weights_sha256": loaded.card.get("sha256"),
-        "dataset": manifest.get("name"),
+        "dataset": dataset.manifest.name,
         "scenes": len(scenes),
         "samples_per_scene": options.num_samples,
         "seed": options.seed,
-        "judge": options.judge,
+        "checker": options.checker,
         "physics": physics_of(checker),
         "rows": [],
     }
@@ -134,15 +122,14 @@ def main() -> None:
 
 def measure(row: Row, sampler: Any, scenes: Sequence[Any], checker: Any, options: argparse.Namespace) -> dict[str, Any]:
     """Quality and time of a row."""
-    from stackgen.evaluation.protocol import evaluate
-    from stackgen.sampling.verified import Budget, VerifiedSampler, referee
+    from stackgen.evaluation.protocol import Request, evaluate
+    from stackgen.sampling.verified import Budget, VerifiedSampler, checker_named
 
     if row.verify is not None:
-        judge = referee(row.verify, checker)
-        sampler = VerifiedSampler(sampler, judge, Budget(options.draws), sampler.grid, row.verify)
-    found = evaluate(
-        sampler, scenes, referee(options.judge, checker), options.num_samples, options.seed, method=row.name
-    )
+        chooser = checker_named(row.verify, checker)
+        sampler = VerifiedSampler(sampler, chooser, Budget(options.draws), row.verify)
+    request = Request(row.name, sampler.world, sampler, num_samples=options.num_samples, seed=options.seed)
+    found = evaluate(request, scenes, checker_named(options.checker, checker))
     estimates = {name: found.estimate(name) for name in METRICS}
 
     def once(number: int) -> Callable[[], object]:
@@ -183,7 +170,7 @@ def tables(results: Sequence[dict[str, Any]], scenes: int, samples: int) -> list
 
 
 def percent(estimate: dict[str, float] | None) -> str:
-    """A figure with its interval."""
+    """A metric with its interval."""
     if estimate is None:
         return "-"
     return f"{100 * estimate['value']:.1f} ({100 * estimate['low']:.0f}-{100 * estimate['high']:.0f})"

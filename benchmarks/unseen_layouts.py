@@ -7,21 +7,18 @@ file ships with the package, so that nobody needs the training sets to make the 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from benchmarks.common import plain_table, start
-from stackgen.data.generation.generate import TESTSET
+from stackgen.data.arrays import StackArrays
+from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.data.inspection.seen_layouts import seen_layouts
-from stackgen.data.loading.arrays import StackArrays, load_dataset
-from stackgen.data.shards import manifest_sha256
-from stackgen.errors import StackgenError
 from stackgen.evaluation.protocol import scenes_of
-from stackgen.evaluation.report.known import SEEN_FILE, SEEN_FORMAT
-from stackgen.io.files import write_atomically
+from stackgen.evaluation.report.references import SEEN_FILE, SEEN_FORMAT
+from stackgen.io.files import write_json
 
 NOTIONS = {"designs": True, "layouts": False}
 """Whether the cell in which each block begins counts."""
@@ -40,8 +37,8 @@ def parser() -> argparse.ArgumentParser:
 def main() -> None:
     """Compare, print, write."""
     options = parser().parse_args()
-    splits, manifest = load_dataset(TESTSET, ("test",))
-    test = splits["test"]
+    testset = Dataset.open(TESTSET)
+    test = testset.split("test")
     entries = [compare(path, test) for path in options.datasets]
     names = [entry["name"] for entry in entries]
     for entry in entries:
@@ -51,8 +48,8 @@ def main() -> None:
             for entry in entries]  # fmt: skip
     heading = ("training set", "stacks", *(f"unseen {notion}" for notion in NOTIONS))
     Console().print(plain_table(f"Of {len(test)} scenes", heading, rows))
-    content = {"format": SEEN_FORMAT, "test_set": manifest_sha256(manifest), "training_sets": entries}
-    write_atomically(options.out, (json.dumps(content) + "\n").encode())
+    content = {"format": SEEN_FORMAT, "test_set": testset.manifest.sha256, "training_sets": entries}
+    write_json(options.out, content, indent=None)
 
 
 def compare(path: Path, test: StackArrays) -> dict[str, Any]:
@@ -61,18 +58,17 @@ def compare(path: Path, test: StackArrays) -> dict[str, Any]:
     Raises:
         StackgenError: If it has no training split.
     """
-    splits, manifest = load_dataset(path, ("train",))
-    if "train" not in splits:
-        raise StackgenError(f"{path} has no training split")
-    names = [scene.name for scene in scenes_of(test)]
+    dataset = Dataset.open(path)
+    train = dataset.split("train")
+    names = [scene.name for scene in scenes_of(test, dataset.world.catalogue)]
     unseen = {}
     for notion, positions in NOTIONS.items():
-        seen = seen_layouts(splits["train"], test, positions=positions)
+        seen = seen_layouts(train, test, dataset.world, positions=positions)
         unseen[notion] = [name for name, known in zip(names, seen, strict=True) if not known]
     return {
-        "name": manifest["name"],
-        "sha256": manifest_sha256(manifest),
-        "stacks": len(splits["train"]),
+        "name": dataset.manifest.name,
+        "sha256": dataset.manifest.sha256,
+        "stacks": len(train),
         "unseen": unseen,
     }
 

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import yaml
 
+from stackgen.data.dataset import Dataset
+from stackgen.data.generation.designs import Design, DesignSettings, cells_wide, draw_design, realize
 from stackgen.data.generation.generate import GenerateSettings, template_samples
-from stackgen.data.generation.templates import Template, TemplateSettings, cells_wide, draw_template, realize
-from stackgen.data.shards import Manifest, Sample, write_shard
+from stackgen.data.manifest import Manifest
+from stackgen.data.shards import Sample, write_shard
 from stackgen.errors import StackgenError
 from stackgen.geometry import mirror, silhouette
 from stackgen.models.weights import last_checkpoint
@@ -21,7 +23,7 @@ from stackgen.sim.simulator import Simulator
 from stackgen.stack import Stack
 from stackgen.vision.drawings import grid_offset
 from stackgen.viz.render import save_image
-from stackgen.world import PAPER_GRID, Catalogue, Grid
+from stackgen.world import PAPER_GRID, Catalogue, Grid, World
 from tests.conftest import Cli
 from tests.test_configs import settings_of
 
@@ -134,7 +136,7 @@ def test_what_stands_on_the_cells_of_a_grid_of_any_width_stays_there(grid: Grid)
     x = -grid.width / 2 + 0.5 + np.array([0, 1, 1, 2])
     poses = [[a, 0, z, 0, 0, 0] for a, z in zip(x, (0.5, 0.5, 1.5, 0.5), strict=True)]
     tower = Stack(np.array([0, 0, 0, 0]), np.array(poses))
-    on_cells = silhouette(tower, grid=grid)
+    on_cells = silhouette(tower, grid)
     assert grid_offset(on_cells, grid) == 0
     shift = round(grid.pixels_per_cell / 2) - 1
     assert grid_offset(np.roll(on_cells, shift, axis=1), grid) == -shift
@@ -143,9 +145,9 @@ def test_what_stands_on_the_cells_of_a_grid_of_any_width_stays_there(grid: Grid)
 # Designs.
 
 
-def designs(settings: GenerateSettings, count: int = 200) -> list[Template]:
+def designs(settings: GenerateSettings, count: int = 200) -> list[Design]:
     rng = np.random.default_rng(0)
-    return [draw_template(rng, settings.template, settings.catalogue, settings.grid) for _ in range(count)]
+    return [draw_design(rng, settings.world, settings.template) for _ in range(count)]
 
 
 def test_rows_are_of_one_height_and_fill_the_grid(wide: GenerateSettings) -> None:
@@ -164,38 +166,38 @@ def test_rows_are_of_one_height_and_fill_the_grid(wide: GenerateSettings) -> Non
 def test_every_shape_is_drawn_and_nothing_is_cut_off_in_the_picture(wide: GenerateSettings) -> None:
     rng = np.random.default_rng(1)
     seen = np.zeros(7, int)
-    still = TemplateSettings(4, 0.0, ("triangle",))
+    still = DesignSettings(4, 0.0, ("triangle",))
     for template in designs(wide, 60):
-        stack = realize(template, rng, wide.template, wide.catalogue, wide.grid)
+        stack = realize(template, rng, wide.world, wide.template)
         seen += stack.counts
-        picture = silhouette(stack, grid=wide.grid)
+        picture = silhouette(stack, wide.grid)
         assert not picture[:, [0, -1]].any() and not picture[[0, -1]].any()
-        exact = silhouette(realize(template, rng, still, wide.catalogue, wide.grid), grid=wide.grid)
+        exact = silhouette(realize(template, rng, wide.world, still), wide.grid)
         area = sum(wide.catalogue[s].area for s in stack.shapes)
         assert exact.sum() / wide.grid.pixels_per_cell**2 == pytest.approx(area, abs=0.15 * len(stack))
     assert (seen > 0).all()
 
 
 def test_a_mirrored_design_is_the_mirror_image(wide: GenerateSettings) -> None:
-    still = TemplateSettings(4, 0.0, ("triangle",))
+    still = DesignSettings(4, 0.0, ("triangle",))
     rng = np.random.default_rng(0)
     for template in designs(wide, 30):
-        stack = realize(template, rng, still, wide.catalogue, wide.grid)
-        other = realize(template.mirrored(wide.catalogue, wide.grid), rng, still, wide.catalogue, wide.grid)
+        stack = realize(template, rng, wide.world, still)
+        other = realize(template.mirrored(wide.world), rng, wide.world, still)
         a, b = (sorted(zip(s.shapes.tolist(), s.poses.tolist(), strict=True)) for s in (mirror(stack), other))
         assert a == b
 
 
 def test_a_shape_takes_up_whole_cells_and_stands_in_their_middle() -> None:
     catalogue = Catalogue.from_config(["cube", {"name": "coin", "width": 1.4}])
-    row = Template((((1, 0), (0, 2)),))
-    stack = realize(row, np.random.default_rng(0), TemplateSettings(displacement=0), catalogue, PAPER_GRID)
+    row = Design((((1, 0), (0, 2)),))
+    stack = realize(row, np.random.default_rng(0), World(catalogue, PAPER_GRID, 10), DesignSettings(displacement=0))
     assert stack.poses[:, 0].tolist() == [-1, 0.5]
     assert cells_wide(catalogue[1]) == 2
 
 
 def test_stacks_of_the_example_settle(wide: GenerateSettings) -> None:
-    with Simulator(wide.physics, wide.catalogue) as simulator:
+    with Simulator(wide.physics) as simulator:
         found: list[Sample] = []
         number = 0
         while len(found) < 3:
@@ -217,16 +219,16 @@ def dataset(wide: GenerateSettings, tmp_path_factory: pytest.TempPathFactory) ->
     for number, (split, size) in enumerate((("train", 24), ("validation", 4), ("test", 2))):
         samples: list[Sample] = []
         while len(samples) < size:
-            design = draw_template(rng, wide.template, wide.catalogue, wide.grid)
-            stack = realize(design, rng, wide.template, wide.catalogue, wide.grid)
+            design = draw_design(rng, wide.world, wide.template)
+            stack = realize(design, rng, wide.world, wide.template)
             if len(stack) <= wide.max_blocks:
                 meta = {"template": 100 * number + len(samples), "layout": design.key, "removed": []}
-                picture = silhouette(stack, grid=wide.grid)
+                picture = silhouette(stack, wide.grid)
                 shapes, poses = stack.shapes.astype(np.uint8), stack.poses.astype(np.float32)
                 samples.append(Sample(f"{number}{len(samples):03d}", shapes, poses, picture, meta))
         entries.append(write_shard(folder / f"{split}-{number:06d}.tar", samples))
     physics = wide.physics.to_json()
-    Manifest("wide", 0, wide.catalogue, wide.grid, wide.max_blocks, physics, {}, tuple(entries)).save(folder)
+    Manifest("wide", 0, wide.world, physics, {}, tuple(entries)).save(folder)
     return folder
 
 
@@ -263,8 +265,8 @@ def test_a_world_goes_the_whole_path(
     assert Catalogue.from_json(card["catalogue"]) == wide.catalogue and Grid(**card["grid"]) == wide.grid
     assert card["max_blocks"] == 20 and card["dataset"]["physics"]["friction"] == 0.6
 
-    weights = ["--model.weights", sampler, "--model.block_list_weights", predictor]
-    answer = cli("test", *weights, "--data.test_path", dataset, "--model.num_samples", 1)
+    weights = ["--weights", sampler, "--block_list_weights", predictor]
+    answer = cli("test", *weights, "--test_set", dataset, "--num_samples", 1)
     assert answer.code == 0, answer.err
     (report,) = tmp_path.glob("runs/*/test_*/metrics.json")
     rows = json.loads(report.read_text())["rows"]
@@ -274,7 +276,7 @@ def test_a_world_goes_the_whole_path(
     refused = cli("test", *weights)  # the paper's test set
     assert refused.code == 2 and "another catalogue and grid" in refused.line
 
-    stack = next(Manifest.load(dataset).samples(dataset, "test"))
+    stack = next(Dataset.open(dataset).samples("test"))
     save_image("scene.png", stack.silhouette)
     answer = cli(
         "sample", "scene.png", "--weights", sampler, "--block_list_weights", predictor, "--num_samples", 1, "--out", "o"
@@ -302,4 +304,4 @@ def test_the_example_generates(cli: Cli, tmp_path: Path) -> None:
     options = ["--stacks", 12, "--templates_per_shard", 2, "--workers", 1, "--max_removals", 1]
     answer = cli("generate", "--config", WIDE, "--out", out, *options)
     assert answer.code == 0, answer.err
-    assert Manifest.load(out).catalogue == settings_of(WIDE).catalogue
+    assert Dataset.open(out).manifest.world.catalogue == settings_of(WIDE).catalogue

@@ -120,7 +120,7 @@ class Request:
 
     def __post_init__(self) -> None:
         if self.num_samples < 1 or self.batch_size < 1 or not 0 <= self.seed < 2**63:
-            raise StackgenError("num_samples and batch_size must be at least 1, and the seed at least 0")
+            raise StackgenError("evaluation: num_samples and batch_size must be at least 1, seed at least 0")
 
     @property
     def block_list(self) -> str:

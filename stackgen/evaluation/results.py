@@ -24,6 +24,7 @@ from stackgen.stack import Stack
 from stackgen.world import VIEWS, Catalogue
 
 FORMAT = "stackgen.evaluation/2"
+_BEFORE = "stackgen.evaluation/1"
 
 TRUE_LIST, PREDICTED_LIST = "true", "predicted"
 """Whose block lists a row was asked with: those of the scenes, or a network's."""
@@ -172,8 +173,10 @@ def read_evaluation(path: Path) -> tuple[Evaluation, Question]:
     """
     try:
         data = json.loads(path.read_text())
+        if data["format"] == _BEFORE:
+            raise StackgenError(f"{path} was written by an older version, and is not read")
         if data["format"] != FORMAT:
-            raise StackgenError(f"{path} is of an older version ({data['format']}): it is asked again")
+            raise ValueError(data["format"])
         (row,) = data["rows"]
         catalogue = None if row["catalogue"] is None else Catalogue.from_json(row["catalogue"])
         scenes = tuple(_scene_from_json(scene, catalogue) for scene in row["results"])

@@ -11,7 +11,6 @@ import yaml
 
 import stackgen
 from stackgen.baselines import HEURISTICS
-from stackgen.commands.test import WeightsUnderTest
 from stackgen.data.dataset import TESTSET
 from stackgen.errors import StackgenError
 from stackgen.evaluation.protocol import load_scenes
@@ -122,8 +121,7 @@ def test_sample_on_the_command_line(cli: Cli, tower_image: Path, tmp_path: Path)
 
 @every_heuristic
 def test_a_configuration_holds_the_settings_that_the_name_stands_for(name: str) -> None:
-    model = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())["test"]["model"]
-    weights = model["init_args"]["weights"]
+    weights = yaml.safe_load((CONFIGS / f"{name}.yaml").read_text())["test"]["weights"]
     assert weights["class_path"] == f"stackgen.baselines.{HEURISTICS[name].__name__}"
     assert weights.get("init_args", {}) == HEURISTICS[name]().settings
 
@@ -133,37 +131,27 @@ def test_the_protocol_runs_on_a_configuration(
     name: str, cli: Cli, tiny: TinyWeights, towers_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    data = ["--data.test_path", towers_dataset, "--model.block_list_weights", tiny.predictor]
-    answer = cli("test", "--config", CONFIGS / f"{name}.yaml", *data, "--trainer.enable_progress_bar", "false")
+    data = ["--test_set", towers_dataset, "--block_list_weights", tiny.predictor]
+    answer = cli("test", "--config", CONFIGS / f"{name}.yaml", *data)
     assert answer.code == 0, answer.err
     rows = json.loads((tmp_path / "runs" / name / "test_0" / "metrics.json").read_text())["rows"]
-    assert [row["block_list"] for row in rows] == ["ground truth", "predicted", "ground truth"]
+    assert [row["block_list"] for row in rows] == ["true", "predicted", "true"]
     assert [row["scenes"] for row in rows] == [12, 12, 12]
     assert rows[0]["weights"] == name
     assert rows[0].get("sampler", {}) == HEURISTICS[name]().settings
     assert rows[0]["weights_sha256"] == HEURISTICS[name]().card["sha256"]
 
 
-def test_the_frozen_test_set_is_what_a_configuration_is_asked_about(cli: Cli) -> None:
-    answer = cli("test", "--config", CONFIGS / "brute-force.yaml", "--print_config")
-    printed = yaml.safe_load(answer.out)
-    assert printed["data"]["path"] == str(TESTSET) and printed["data"]["eval_batch_size"] == 64
-    answer = cli("test", "--config", CONFIGS / "brute-force.yaml", "--data.path", "mine", "--print_config")
-    assert yaml.safe_load(answer.out)["data"]["path"] == "mine"
-
-
 def test_a_name_is_enough_for_a_test_and_what_is_no_sampler_is_refused(cli: Cli) -> None:
-    assert WeightsUnderTest("greedy-random").method == "greedy-random"
-    answer = cli("test", "--model.weights", "greedy", "--data.path", TESTSET)
+    answer = cli("test", "--weights", "greedy")
     assert answer.code == 2 and "no weights called greedy" in answer.line
-    model = ["--model", f"{WeightsUnderTest.__module__}.WeightsUnderTest"]
-    assert cli("test", *model, '--model.weights={"class_path": "stackgen.stack.Stack"}').code == 2
+    assert cli("test", '--weights={"class_path": "stackgen.stack.Stack"}').code == 2
 
 
-def test_a_checkpoint_beside_a_configuration_is_refused(
-    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_checkpoint_beside_a_configuration_of_weights_is_refused(
+    cli: Cli, tiny: TinyWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    answer = cli("test", "--config", CONFIGS / "brute-force.yaml", "--ckpt_path", "x.ckpt")
-    assert answer.code == 2 and "without a configuration" in answer.line
+    answer = cli("test", "--config", CONFIGS / "brute-force.yaml", "--ckpt_path", tiny.sampler)
+    assert answer.code == 2 and "give one of them" in answer.line
     assert not (tmp_path / "runs").exists()

@@ -192,11 +192,11 @@ def test_fit_test_and_sample_from_the_command_line(
     answer = cli("fit", "--config", "short.yaml", "--data.path", compact)
     assert answer.code == 0, answer.err
     checkpoint = last_checkpoint(Path("runs") / method)
-    lists = ["--model.block_list_weights", tiny.predictor]
-    answer = cli("test", "--model.weights", checkpoint, *lists, "--data.test_path", compact, "--name", method)
+    lists = ["--block_list_weights", tiny.predictor]
+    answer = cli("test", "--weights", checkpoint, *lists, "--test_set", compact, "--name", method)
     assert answer.code == 0, answer.err
     rows = json.loads(Path(f"runs/{method}/test_0/metrics.json").read_text())["rows"]
-    assert len(rows) == 3  # true list, predicted list, ceiling
+    assert len(rows) == 3  # true list, predicted list, ground truth
     assert cli("export", f"runs/{method}", "--out", "weights.safetensors").code == 0
     given = ["--weights", "weights.safetensors", "--blocks", "cube=3", "--out", "out"]
     answer = cli("sample", tower_image, *given)

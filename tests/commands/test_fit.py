@@ -1,4 +1,4 @@
-"""fit, validate, test, predict and export: every run its own folder, and a killed one goes on."""
+"""fit, validate and export: every run its own folder, and a killed one goes on."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ import pytest
 import torch
 import yaml
 
-from stackgen.io.stacks_file import read_stacks
 from stackgen.models.optimization import OptimizerConfig, learning_rate_share
-from stackgen.models.weights import last_checkpoint, load_sampler
-from tests.conftest import CHILD, Cli, TinyWeights, allow_interrupts
+from stackgen.models.weights import last_checkpoint
+from stackgen.sampling.methods import load_sampler
+from tests.conftest import CHILD, Cli, allow_interrupts
 
 CONFIG = """
 name: tiny
 trainer: {{max_epochs: {epochs}, log_every_n_steps: 1, enable_progress_bar: false, enable_model_summary: false}}
 model:
-  class_path: stackgen.models.diffusion.module.DDPM
+  class_path: stackgen.models.DDPM
   init_args:
     denoiser: {{width: 32, layers: 1, heads: 2, feedforward: 64}}
     optimizer: {{learning_rate: 0.001, warmup: 2}}
@@ -86,8 +86,8 @@ trainer:
   precision: bf16-mixed
   accumulate_grad_batches: 2
   max_epochs: 3
-  callbacks: [{{class_path: stackgen.training.callbacks.Compile, init_args: {{backend: {backend}}}}},
-              {{class_path: stackgen.training.callbacks.EMA}}]
+  callbacks: [{{class_path: stackgen.training.Compile, init_args: {{backend: {backend}}}}},
+              {{class_path: stackgen.training.EMA}}]
 """
 
 
@@ -183,51 +183,6 @@ def test_validate_finds_the_configuration_beside_the_checkpoint(cli: Cli, config
     with Path("runs/tiny/version_0/metrics.csv").open() as file:
         logged = [row["validation/loss"] for row in csv.DictReader(file) if row["validation/loss"]]
     assert metrics["validation/loss"] == pytest.approx(float(logged[-1]), rel=1e-5)
-
-
-def test_protocol_of_a_checkpoint_leaves_figures_for_both_lists_and_the_ceiling(
-    cli: Cli, config: Path, tiny: TinyWeights, towers_dataset: Path
-) -> None:
-    assert cli("fit", "--config", config).code == 0
-    data = ["--data.path", towers_dataset, "--data.test_path", towers_dataset]
-    options = ["--model.block_list_weights", tiny.predictor, "--trainer.enable_progress_bar", "false"]
-    answer = cli("test", "--ckpt_path", "runs/tiny/version_0/checkpoints/last.ckpt", *data, *options)
-    assert answer.code == 0, answer.err
-    content = json.loads(Path("runs/run/test_0/metrics.json").read_text())
-    assert [row["block_list"] for row in content["rows"]] == ["ground truth", "predicted", "ground truth"]
-    assert [row["scenes"] for row in content["rows"]] == [12, 12, 12]
-    assert content["rows"][2]["metrics"]["stability"]["value"] == 1  # the ceiling: towers stand
-    assert len(list(Path("runs/run/test_0").glob("scenes-*.csv"))) == 3
-    run = json.loads(Path("runs/run/test_0/run.json").read_text())
-    assert run["dataset"]["path"] == str(towers_dataset) and len(run["dataset"]["sha256"]) == 64
-
-
-def test_a_block_list_network_is_tested_with_the_shipped_sampler(
-    cli: Cli, tiny: TinyWeights, towers_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    data = ["--data.path", towers_dataset, "--data.test_path", towers_dataset]
-    options = ["--model.weights", tiny.sampler, "--trainer.enable_progress_bar", "false"]
-    answer = cli("test", "--ckpt_path", tiny.predictor, *data, *options)
-    assert answer.code == 0, answer.err
-    asked = yaml.safe_load(Path("runs/run/test_0/config.yaml").read_text())["model"]["init_args"]
-    assert asked["weights"] == str(tiny.sampler) and asked["block_list_weights"] == str(tiny.predictor)
-    assert json.loads(Path("runs/run/test_0/metrics.json").read_text())["rows"][1]["block_list"] == "predicted"
-
-
-def test_predict_writes_a_stacks_file_for_each_scene(
-    cli: Cli, config: Path, tiny: TinyWeights, towers_dataset: Path
-) -> None:
-    data = ["--data.path", towers_dataset, "--data.test_path", towers_dataset]
-    weights = ["--model.weights", tiny.sampler, "--model.num_samples", 2, "--trainer.enable_progress_bar", "false"]
-    answer = cli("predict", *data, *weights, "--trainer.default_root_dir", "out")
-    assert answer.code == 0, answer.err
-    files = sorted(Path("out/run/predict_0").glob("*-t*.json"))
-    assert len(files) == 12
-    content = read_stacks(files[1])
-    assert content.target is not None and content.block_list is not None
-    assert content.block_list.tolist() == [2, 0, 0, 0]
-    assert [stack.names for stack in content.stacks] == [["cube", "cube"]] * 2
 
 
 def test_an_exported_checkpoint_samples_as_the_checkpoint_does(cli: Cli, config: Path, tower_image: Path) -> None:

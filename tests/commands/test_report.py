@@ -11,10 +11,11 @@ import pytest
 import yaml
 
 from stackgen.commands import report
-from stackgen.evaluation.protocol import Evaluation
-from stackgen.evaluation.report import plan
-from stackgen.evaluation.report.rows import check_rows
-from stackgen.evaluation.results import PREDICTED_LIST, TRUE_LIST
+from stackgen.data.dataset import Dataset
+from stackgen.evaluation.protocol import Request
+from stackgen.evaluation.report.rows import ReportSettings, check_rows
+from stackgen.evaluation.report.tasks import tasks_of
+from stackgen.evaluation.results import PREDICTED_LIST, TRUE_LIST, Evaluation
 from tests.conftest import Cli
 
 CONFIG = Path(__file__).parents[2] / "configs" / "report.yaml"
@@ -28,7 +29,7 @@ def small(towers_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         {"name": "Random", "model": {"weights": "random-placement"}},
         {"name": "Truth", "model": {"weights": "ground-truth"}},
     ]
-    settings = {"rows": rows, "test_set": str(towers_dataset), "num_samples": 2, "ceiling": None}
+    settings = {"rows": rows, "test_set": str(towers_dataset), "num_samples": 2, "diversity_limit": None}
     (tmp_path / "report.yaml").write_text(yaml.safe_dump({"report": settings}))
 
     def command(*more: str) -> list[str]:
@@ -49,9 +50,9 @@ def test_a_report_is_made_once_and_then_read(
     assert [(row["method"], row["block_list"]) for row in rows] == [
         ("Random", TRUE_LIST), ("Random", PREDICTED_LIST), ("Truth", TRUE_LIST),
     ]  # fmt: skip
-    assert rows[2]["figures"]["all"]["metrics"]["stability"]["value"] == 1
+    assert rows[2]["metrics"]["all"]["stability"]["value"] == 1
     before = Path("out/table.md").read_bytes()
-    monkeypatch.setattr(report, "answer", refuse)
+    monkeypatch.setattr(report, "evaluate", refuse)
     again = cli(*small())
     assert again.code == 0, again.err
     assert "to be run" not in again.out and Path("out/table.md").read_bytes() == before
@@ -65,15 +66,15 @@ def test_an_interrupted_report_goes_on(
     small: Callable[..., list[str]], cli: Cli, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[tuple[str, str]] = []
-    whole = report.answer
+    whole = report.evaluate
 
-    def interrupted(task: Any, *rest: Any) -> Evaluation:
-        asked.append((task.row.name, task.block_list))
+    def interrupted(request: Request, *rest: Any) -> Evaluation:
+        asked.append((request.method, request.block_list))
         if len(asked) == 2:
             raise KeyboardInterrupt
-        return whole(task, *rest)
+        return whole(request, *rest)
 
-    monkeypatch.setattr(report, "answer", interrupted)
+    monkeypatch.setattr(report, "evaluate", interrupted)
     stopped = cli(*small())
     assert stopped.code == 130 and "1 of 3 are done and kept" in stopped.err
     assert not Path("out").exists()
@@ -84,50 +85,23 @@ def test_an_interrupted_report_goes_on(
 def test_what_stackgen_test_found_is_not_run_again(
     small: Callable[..., list[str]], cli: Cli, towers_dataset: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    options = ["--model.weights", "random-placement", "--model.num_samples", "2", "--data.test_path", towers_dataset]
-    tested = cli("test", *options, "--trainer.accelerator", "cpu", "--trainer.enable_progress_bar", "false")
+    tested = cli("test", "--weights", "random-placement", "--num_samples", "2", "--test_set", towers_dataset)
     assert tested.code == 0, tested.err
-    asked: list[str] = []
-    whole = report.answer
-
-    def counted(task: Any, *rest: Any) -> Evaluation:
-        asked.append(task.row.name)
-        return whole(task, *rest)
-
-    monkeypatch.setattr(report, "answer", counted)
+    monkeypatch.setattr(report, "evaluate", refuse)
     made = cli(*small())
     assert made.code == 0, made.err
-    assert asked == ["Truth"] and "kept in runs/run/test_0/evaluation-predicted.json" in made.out
-
-
-def test_a_row_without_weights_is_read_from_its_record(small: Callable[..., list[str]], cli: Cli) -> None:
-    content = yaml.safe_load(Path("report.yaml").read_text())
-    row = content["report"]["rows"][0]
-    row["recorded"] = "records/random.json"
-    Path("report.yaml").write_text(yaml.safe_dump(content))
-    assert cli(*small()).code == 0
-    assert Path("records/random.json").exists()
-    row["model"]["weights"] = "too-large.safetensors"
-    Path("report.yaml").write_text(yaml.safe_dump(content))
-    answer = cli(*small("--seed", "1"))
-    assert answer.code == 0, answer.err
-    assert "Random: recorded in records/random.json (no weights at too-large.safetensors)" in answer.out
-    text = Path("out/table.md").read_text()
-    assert "| Random † | true |" in text and "seed 0, not 1" in text
-    Path("records/random.json").unlink()
-    gone = cli(*small())
-    assert gone.code == 2 and "no weights at too-large.safetensors, and no record at records/random.json" in gone.line
+    assert "kept in runs/run/test_0/evaluation-ground-truth.json" in made.out
+    assert "kept in runs/run/test_0/evaluation-predicted.json" in made.out
 
 
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["--limit", "0"], "limit must be at least 1"),
-        (["--limit", "3", "--out", "docs/results"], "another folder"),
-        (["--workers", "0"], "workers must be at least 1"),
+        (["--limit", "0"], "must be at least 1"),
+        (["--workers", "0"], "must be at least 1"),
         (["--rows", "[]"], "no rows"),
         (["--rows", '[{"name": "a", "model": {"weights": "nowhere"}}]'], "row 'a': no weights called nowhere"),
-        (["--rows", '[{"name": "a", "model": {"weights": "random-placement", "seed": 3}}]'], "for all rows alike"),
+        (["--rows", '[{"name": "a", "model": {"weights": "random-placement", "seed": 3}}]'], "seed"),
         (["--rows", '[{"name": "a", "model": {"weights": "random-placement", "wings": 2}}]'], "wings"),
     ],
 )
@@ -136,13 +110,17 @@ def test_mistakes_are_one_line(arguments: list[str], line: str, small: Callable[
     assert answer.code == 2 and line in answer.line
 
 
-def test_the_shipped_configuration_names_what_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every row's weights are here, or its record is; each of the paper's methods has a row."""
-    monkeypatch.chdir(CONFIG.parents[1])
+def test_the_shipped_rows_are_the_default_and_name_what_there_is() -> None:
+    """Every row's weights are here; each of the paper's methods has a row; the configuration is the package's own."""
+    assert CONFIG.resolve() == report.ROWS.resolve()
     parser = report.COMMAND.parser()
     content = yaml.safe_load(CONFIG.read_text())["report"]
     values = parser.instantiate(parser.parse_args([f"--config={yaml.safe_dump(content)}"]))
     check_rows(values.rows)
-    for row in values.rows:
-        if not row.is_ground_truth and not (row.recorded and row.recorded.is_file()):
-            assert plan.under_test(row, plan.ReportSettings(rows=[row])).method == row.name
+    manifest = Dataset.open(values.test_set).manifest
+    tasks = tasks_of(ReportSettings(rows=values.rows), manifest, 500, {}, {})
+    assert [task.place[0] for task in tasks if task.request.block_list == TRUE_LIST] == [
+        row.name for row in values.rows
+    ]
+    assert {row.paper for row in values.rows} >= {"Brute Force", "Greedy", "Tran-Reg", "Tran-VAE", "StackGen"}
+    assert report.main.__defaults__ is not None and Path("out/report") in report.main.__defaults__

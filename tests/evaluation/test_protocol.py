@@ -4,72 +4,62 @@ from __future__ import annotations
 
 import csv
 import json
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from rich.console import Console
-from torch.utils.data import DataLoader
 
-from stackgen._lightning import pl
-from stackgen.data.generation.templates import draw_template, realize
-from stackgen.data.loading.arrays import StackArrays
-from stackgen.data.shards import Manifest, Sample, write_shard
+from stackgen.data.arrays import StackArrays
+from stackgen.data.generation.designs import draw_design, realize
+from stackgen.data.manifest import Manifest
+from stackgen.data.shards import Sample, write_shard
 from stackgen.errors import StackgenError
 from stackgen.evaluation.intervals import clustered_ratio
-from stackgen.evaluation.metrics import SCENE_METRICS
-from stackgen.evaluation.protocol import (
-    ParallelChecker,
-    SamplerEvaluation,
-    Scene,
-    ceiling,
-    evaluate,
-    load_scenes,
-    scenes_of,
-)
-from stackgen.evaluation.results import (
-    METRICS,
-    Evaluation,
-    format_list_table,
-    format_table,
-    write_metrics,
-    write_scenes,
-)
+from stackgen.evaluation.metrics import METRICS, SCENE_METRICS
+from stackgen.evaluation.parallel import simulating
+from stackgen.evaluation.protocol import Request, Scene, evaluate, load_scenes, scenes_of
+from stackgen.evaluation.results import Evaluation, write_metrics, write_scenes
+from stackgen.evaluation.tables import list_table, metrics_table
 from stackgen.geometry import silhouette
-from stackgen.protocols import Verdict
+from stackgen.protocols import StabilityChecker, Verdict
 from stackgen.sim.checkers import SimulatorChecker
+from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Mask
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Mask
 
 
 def made_samples(count: int, seed: int = 0) -> list[Sample]:
     rng = np.random.default_rng(seed)
     made: list[Sample] = []
     while len(made) < count:
-        stack = realize(draw_template(rng), rng)
+        stack = realize(draw_design(rng, PAPER_WORLD), rng, PAPER_WORLD)
         if len(stack) <= 10:
             arrays = stack.shapes.astype(np.uint8), stack.poses.astype(np.float32)
-            made.append(Sample(f"{len(made):04d}", *arrays, silhouette(stack), {"template": len(made)}))
+            made.append(Sample(f"{len(made):04d}", *arrays, silhouette(stack, PAPER_GRID), {"template": len(made)}))
     return made
 
 
 @pytest.fixture(scope="module")
 def arrays() -> StackArrays:
-    return StackArrays.from_samples(made_samples(20))
+    return StackArrays.from_samples(made_samples(20), PAPER_WORLD)
 
 
 @pytest.fixture(scope="module")
 def scenes(arrays: StackArrays) -> list[Scene]:
-    return scenes_of(arrays)
+    return scenes_of(arrays, PAPER_CATALOGUE)
 
 
 class Truth:
     """Looks the answer up, and lifts every sample whose number is divisible by three a layer."""
 
     def __init__(self, scenes: list[Scene]) -> None:
+        self.world = PAPER_WORLD
+        self.settings: dict[str, Any] = {}
+        self.card: dict[str, Any] = {}
         self.known = {scene.silhouette.tobytes(): scene.truth for scene in scenes}
         self.seeds: list[int] = []
 
@@ -83,8 +73,10 @@ class Truth:
         return stacks
 
 
-class Ground:
+class Ground(StabilityChecker):
     """By which a stack falls unless a block lies on the ground; nothing moves."""
+
+    physics = Physics()
 
     def check(self, stack: Stack) -> Verdict:
         stable = bool(stack.poses[:, 2].min() < 1)
@@ -92,9 +84,11 @@ class Ground:
 
 
 class Lists:
-    """A predictor: the truth for even scenes, for odd ones a list that is never right, the truth second."""
+    """Predicts the truth for even scenes, for odd ones a list that is never right and the truth second."""
 
     def __init__(self, scenes: list[Scene]) -> None:
+        self.world = PAPER_WORLD
+        self.card: dict[str, Any] = {}
         self.known = {scene.silhouette.tobytes(): (i, scene.counts) for i, scene in enumerate(scenes)}
 
     def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> np.ndarray:
@@ -107,11 +101,16 @@ class Lists:
         return np.array(answers)
 
 
+def asked(scenes: Sequence[Scene], truth: Truth | None = None, **options: Any) -> Evaluation:
+    """Evaluate a sampler that knows the truth."""
+    progress = options.pop("progress", None)
+    request = Request("Truth", PAPER_WORLD, truth or Truth(list(scenes)), **options)
+    return evaluate(request, scenes, Ground(), progress)
+
+
 def test_the_protocol_counts_what_a_known_sampler_does(scenes: list[Scene]) -> None:
     steps: list[tuple[int, int]] = []
-    result = evaluate(
-        Truth(scenes), scenes, Ground(), progress=lambda done, total: steps.append((done, total)), batch_size=8
-    )
+    result = asked(scenes, progress=lambda done, total: steps.append((done, total)), batch_size=8)
     assert steps == [(8, 20), (16, 20), (20, 20)]
     values = {name: result.estimate(name) for name in SCENE_METRICS}
     expected = {
@@ -130,66 +129,44 @@ def test_the_protocol_counts_what_a_known_sampler_does(scenes: list[Scene]) -> N
 def test_same_seed_same_questions_and_each_batch_its_own(scenes: list[Scene]) -> None:
     first, again, other = Truth(scenes), Truth(scenes), Truth(scenes)
     for sampler, seed in ((first, 0), (again, 0), (other, 1)):
-        evaluate(sampler, scenes, Ground(), seed=seed, batch_size=8)
+        asked(scenes, sampler, seed=seed, batch_size=8)
     assert first.seeds == again.seeds and len(set(first.seeds) | set(other.seeds)) == 6
 
 
 def test_predicted_lists_are_asked_for_and_judged_themselves(scenes: list[Scene]) -> None:
-    result = evaluate(Truth(scenes), scenes, Ground(), predictor=Lists(scenes))
+    result = asked(scenes, predictor=Lists(scenes))
     assert result.block_list == "predicted"
     lists = {name: e.value for name, e in result.list_estimates().items() if e}
     assert lists == {"exact_match": 0.5, "top3": 1.0, "feasible": 0.5}
     assert all((np.array(r.counts) == s.counts).all() == (i % 2 == 0) for i, (r, s) in
                enumerate(zip(result.scenes, scenes, strict=True)))  # fmt: skip
-    assert evaluate(Truth(scenes), scenes, Ground()).list_estimates() == {}
+    assert asked(scenes).list_estimates() == {}
 
 
 def test_a_drawing_has_no_side_and_no_top(scenes: list[Scene], tmp_path: Path) -> None:
     drawings = [Scene(s.name, s.silhouette, s.counts) for s in scenes]
-    result = evaluate(Truth(scenes), drawings, Ground())
+    result = asked(drawings, Truth(scenes))
     front, average = result.estimate("front_iou"), result.estimate("avg_iou")
     assert front == average
     write_scenes(tmp_path / "s.csv", result)
     with (tmp_path / "s.csv").open() as file:
         assert all(row["side_iou"] == row["top_iou"] == "" for row in csv.DictReader(file))
     with pytest.raises(StackgenError, match="taken from stacks"):
-        ceiling(drawings, Ground())
+        evaluate(Request.ground_truth(PAPER_WORLD), drawings, Ground())
 
 
 def test_nothing_to_evaluate_is_one_line(scenes: list[Scene]) -> None:
     for some, samples in (([], 3), (scenes, 0)):
-        with pytest.raises(StackgenError, match="at least one"):
-            evaluate(Truth(scenes), some, Ground(), samples)
+        with pytest.raises(StackgenError, match="at least"):
+            asked(some, Truth(scenes), num_samples=samples)
 
 
-@pytest.mark.filterwarnings("ignore")
-def test_trainer_test_gives_what_evaluate_gives(arrays: StackArrays, scenes: list[Scene], tmp_path: Path) -> None:
-    for predictor in (None, Lists(scenes)):
-        expected = evaluate(Truth(scenes), scenes, Ground(), predictor=predictor, batch_size=8, seed=3)
-        module = SamplerEvaluation(Truth(scenes), Ground(), predictor=predictor, seed=3)
-        trainer = pl.Trainer(
-            default_root_dir=tmp_path, accelerator="cpu", logger=False, enable_progress_bar=False,
-            enable_model_summary=False,
-        )  # fmt: skip
-        loader: DataLoader[Any] = DataLoader(
-            cast(Any, [arrays.batch(np.arange(20)[i : i + 8]) for i in (0, 8, 16)]), batch_size=None
-        )
-        for _ in range(2):  # a second run forgets the first
-            (logged,) = trainer.test(module, loader, verbose=False)
-        assert module.evaluation is not None
-        assert module.evaluation.summary() == expected.summary()
-        assert module.evaluation.scenes == expected.scenes
-        for name in SCENE_METRICS:
-            estimate = expected.estimate(name)
-            assert estimate is not None and logged[f"test/{name}"] == pytest.approx(estimate.value, abs=1e-6)
-
-
-def test_the_ceiling_is_the_truth_simulated_again(scenes: list[Scene]) -> None:
-    with ParallelChecker(partial(SimulatorChecker, until_fall=True), 2) as parallel:
-        shared = ceiling(scenes[:6], parallel)
-    alone = ceiling(scenes[:6], SimulatorChecker(until_fall=True))
-    assert shared == alone
-    assert shared.physics is not None and "pybullet" in shared.physics["engine"]
+def test_ground_truth_is_simulated_again_alike_on_one_process_and_on_two(scenes: list[Scene]) -> None:
+    request = Request.ground_truth(PAPER_WORLD)
+    with simulating(workers=2) as parallel, simulating() as alone:
+        shared = evaluate(request, scenes[:6], parallel)
+        assert shared == evaluate(request, scenes[:6], alone)
+    assert "pybullet" in shared.physics["engine"] and shared.sampling_seconds == 0
     for scene, result in zip(scenes, shared.scenes, strict=False):
         assert scene.truth is not None
         score = result.score.samples[0]
@@ -200,13 +177,15 @@ def test_the_ceiling_is_the_truth_simulated_again(scenes: list[Scene]) -> None:
 
 @pytest.fixture
 def some(scenes: list[Scene]) -> Evaluation:
-    return evaluate(Truth(scenes), scenes, Ground(), predictor=Lists(scenes), facts={"weights": "default"})
+    return asked(scenes, predictor=Lists(scenes), facts={"weights": "default"})
 
 
 def test_metrics_json_says_what_was_measured_and_how(some: Evaluation, tmp_path: Path) -> None:
-    write_metrics(tmp_path / "metrics.json", some)
+    write_metrics(tmp_path / "metrics.json", [some])
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
-    found = json.loads((tmp_path / "metrics.json").read_text())
+    content = json.loads((tmp_path / "metrics.json").read_text())
+    (found,) = content["rows"]
+    assert content["format"] == "stackgen.evaluation/2"
     assert (found["scenes"], found["samples"], found["samples_per_scene"], found["seed"]) == (20, 60, 3, 0)
     assert found["block_list"] == "predicted" and found["weights"] == "default"
     assert set(found["metrics"]) == set(METRICS) and set(found["block_lists"]) == {
@@ -214,9 +193,9 @@ def test_metrics_json_says_what_was_measured_and_how(some: Evaluation, tmp_path:
     }  # fmt: skip
     for estimate in found["metrics"].values():
         assert 0 <= estimate["low"] <= estimate["value"] <= estimate["high"] <= 1
-    write_metrics(tmp_path / "new" / "metrics.json", some)
+    write_metrics(tmp_path / "new" / "metrics.json", [some])
     with pytest.raises(StackgenError, match="cannot be written"):
-        write_metrics(tmp_path / "metrics.json" / "metrics.json", some)
+        write_metrics(tmp_path / "metrics.json" / "metrics.json", [some])
 
 
 def test_the_scenes_file_adds_up_to_the_metrics(some: Evaluation, tmp_path: Path) -> None:
@@ -232,20 +211,20 @@ def test_the_scenes_file_adds_up_to_the_metrics(some: Evaluation, tmp_path: Path
 def test_the_table_shows_the_paper_beside(some: Evaluation) -> None:
     console = Console(width=80, record=True)
     with console.capture() as capture:
-        console.print(format_table([some]))
-        console.print(format_list_table([some]))
+        console.print(metrics_table([some]))
+        console.print(list_table([some]))
     text = capture.get()
     for figure in ("84.20", "66.87", "74.39", "71.31", "85.20", "64.53", "75.08", "71.84", "66.67", "66.7-66.7"):
         assert figure in text
     assert "50.00" in text and "100.0-100.0" in text
-    assert format_list_table([]) is None
+    assert list_table([]) is None
 
 
 def test_scenes_are_loaded_from_a_dataset(tmp_path: Path, scenes: list[Scene]) -> None:
     shard = write_shard(tmp_path / "test-000000.tar", made_samples(20))
-    Manifest("t", 0, PAPER_CATALOGUE, PAPER_GRID, 10, {}, {}, (shard,)).save(tmp_path)
-    loaded, manifest = load_scenes(tmp_path)
-    assert manifest["counts"]["test"] == 20
+    Manifest("t", 0, PAPER_WORLD, {}, {}, (shard,)).save(tmp_path)
+    loaded, dataset = load_scenes(tmp_path)
+    assert dataset.manifest.count("test") == 20
     for a, b in zip(loaded, scenes, strict=True):
         assert a.name == b.name and np.array_equal(a.silhouette, b.silhouette) and np.array_equal(a.counts, b.counts)
         assert a.truth is not None and b.truth is not None and np.array_equal(a.truth.poses, b.truth.poses)

@@ -277,9 +277,8 @@ def test_the_protocol_measures_verified_sampling_under_its_own_name(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     options = [
-        *("--data.path", towers_dataset, "--data.test_path", towers_dataset, "--trainer.enable_progress_bar", "false"),
-        *("--model.weights", tiny.sampler, "--model.predicted_lists", "false", "--model.num_samples", 1),
-        *("--model.sampler.kind", "dpm", "--model.sampler.steps", 2, "--model.verify", "statics", "--model.draws", 4),
+        *("--test_set", towers_dataset, "--weights", tiny.sampler, "--predicted_lists", "false", "--num_samples", 1),
+        *("--sampler.kind", "dpm", "--sampler.steps", 2, "--verify", "statics", "--draws", 4),
     ]
     answer = cli("test", *options)
     assert answer.code == 0, answer.err

@@ -13,42 +13,48 @@ import numpy as np
 import pytest
 
 from stackgen.errors import StackgenError
-from stackgen.evaluation.metrics import SampleScore, SceneScore
-from stackgen.evaluation.protocol import Evaluation, SceneResult
-from stackgen.evaluation.report import plan
+from stackgen.evaluation.intervals import Estimate
+from stackgen.evaluation.metrics import METRICS, SampleScore, SceneScore
 from stackgen.evaluation.report.charts import draw_charts
-from stackgen.evaluation.report.collect import Store, read_record, world_apart, write_record
-from stackgen.evaluation.report.figures import ALL, results_of
-from stackgen.evaluation.report.known import (
+from stackgen.evaluation.report.references import (
+    LIMIT_FILE,
     SEEN_FILE,
-    Ceiling,
+    DiversityLimit,
     Unseen,
     format_layout,
     parse_layout,
-    read_ceiling,
+    read_diversity_limit,
     read_unseen,
 )
-from stackgen.evaluation.report.pick import pick_examples
-from stackgen.evaluation.report.questions import sampler_identity
-from stackgen.evaluation.report.rows import Line, Row, Training, check_rows
-from stackgen.evaluation.report.store import differences, key_of, question_of, read_evaluation, write_evaluation
-from stackgen.evaluation.report.tables import World, to_csv, to_json, to_markdown
-from stackgen.evaluation.results import METRICS, PAPER_COLUMNS, PREDICTED_LIST, TRUE_LIST
+from stackgen.evaluation.report.results import ALL, Result, result_of
+from stackgen.evaluation.report.rows import Row, Training, check_rows
+from stackgen.evaluation.report.sheets import pick_examples
+from stackgen.evaluation.report.store import Store, differences, key_of, other_conditions
+from stackgen.evaluation.report.tables import Conditions, csv_rows, to_json, to_markdown
+from stackgen.evaluation.requests import Method
+from stackgen.evaluation.results import (
+    PREDICTED_LIST,
+    TRUE_LIST,
+    Evaluation,
+    SceneResult,
+    read_evaluation,
+    write_csv,
+    write_evaluation,
+)
+from stackgen.evaluation.tables import PAPER_COLUMNS
 from stackgen.sampling.feasible import Layout
 from stackgen.stack import Stack
-from tests.conftest import TinyWeights
 
 ONE: Layout = ((0, 0), (1,), (), ())
 OTHER: Layout = ((1,), (0, 0), (), ())
 THIRD: Layout = ((0, 1), (0,), (), ())
 PHYSICS = {"engine": "pybullet 3.2.7", "friction": 0.5}
-ROW = Row("A method", {"weights": "a"}, paper="StackGen")
+ROW = Row("A method", Method("a"), paper="StackGen")
 
 
 def question(**changes: Any) -> dict[str, Any]:
     asked = {"test_set": "t", "scenes": 2, "num_samples": 3, "seed": 0, "batch_size": 64, "physics": PHYSICS}
-    named = {"sampler": {"weights": "w"}, "block_list": PREDICTED_LIST, "predictor": "p", **asked, **changes}
-    return question_of(**named)
+    return {"sampler": {"weights": "w"}, "block_list": PREDICTED_LIST, "predictor": "p", **asked, **changes}
 
 
 def sample(stable: bool = True, iou: float = 0.9, shape: Layout = ONE) -> SampleScore:
@@ -84,7 +90,7 @@ def test_an_evaluation_is_read_as_it_was_written(answered: Evaluation, tmp_path:
             assert np.array_equal(a.shapes, b.shapes) and np.array_equal(a.poses, b.poses)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "stackgen.evaluation/1"}', '{"format": "else"}'])
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "stackgen.evaluation/2"}', '{"format": "else"}'])
 def test_a_damaged_evaluation_is_one_line(text: str, tmp_path: Path) -> None:
     (tmp_path / "e.json").write_text(text)
     with pytest.raises(StackgenError, match=r"e\.json is damaged"):
@@ -96,7 +102,7 @@ def test_a_damaged_evaluation_is_one_line(text: str, tmp_path: Path) -> None:
     [
         {"sampler": {"weights": "v"}}, {"sampler": {"weights": "w", "settings": {"steps": 8}}},
         {"block_list": TRUE_LIST}, {"predictor": "q"}, {"test_set": "u"}, {"scenes": 3}, {"num_samples": 1},
-        {"seed": 1}, {"batch_size": 8}, {"physics": {**PHYSICS, "friction": 0.4}}, {"physics": None},
+        {"seed": 1}, {"batch_size": 8}, {"physics": {**PHYSICS, "friction": 0.4}},
     ],
 )  # fmt: skip
 def test_another_question_has_another_key(changes: dict[str, Any]) -> None:
@@ -114,15 +120,20 @@ def test_an_answer_is_found_by_its_question_alone(answered: Evaluation, tmp_path
     assert store.find(question(seed=1)) is None
 
 
-def test_half_of_an_answer_is_none(answered: Evaluation, tmp_path: Path) -> None:
+def test_half_of_an_answer_is_none_and_said_to_be(answered: Evaluation, tmp_path: Path) -> None:
     store = Store(tmp_path, tmp_path)
     store.keep(answered, question())
     (file,) = tmp_path.glob("*.json")
-    file.write_text(file.read_text()[:500])
-    assert store.find(question()) is None
+    whole = file.read_text()
+    file.write_text(whole[:500])
+    with pytest.warns(UserWarning, match="damaged"):
+        assert store.find(question()) is None
+    file.write_text(whole.replace("stackgen.evaluation/2", "stackgen.evaluation/1"))
+    with pytest.warns(UserWarning, match="older version"):
+        assert store.find(question()) is None
 
 
-def test_tests_of_another_world_are_left_out_and_named(answered: Evaluation, tmp_path: Path) -> None:
+def test_tests_under_other_conditions_are_left_out_and_named(answered: Evaluation, tmp_path: Path) -> None:
     test = tmp_path / "runs" / "run" / "test_0"
     test.mkdir(parents=True)
     other = question(physics={**PHYSICS, "friction": 0.4}, test_set="another")
@@ -136,68 +147,55 @@ def test_tests_of_another_world_are_left_out_and_named(answered: Evaluation, tmp
     assert here is not None and here[1].parent == test
 
 
-def test_a_record_is_shown_as_such_with_what_was_otherwise(answered: Evaluation, tmp_path: Path) -> None:
-    row = replace(ROW, recorded=tmp_path / "records" / "a.json", training=Training("A", "stackgen fit", 2, "a GPU"))
-    write_record([Line(row, answered, question())])
-    (line,) = read_record(row, {PREDICTED_LIST: question(physics={**PHYSICS, "friction": 0.4}, seed=1)})
-    assert line.recorded and line.evaluation == answered
-    assert line.remarks == ("other physics: friction 0.5, not 0.4", "seed 0, not 1")
-    (same,) = read_record(row, {PREDICTED_LIST: question()})
-    assert same.remarks == ()
-    (other,) = read_record(row, {PREDICTED_LIST: question(predictor="q")})
-    assert other.remarks == ("block lists of another network",)
-    assert row.recorded is not None
-    row.recorded.write_text("{}")
-    with pytest.raises(StackgenError, match="damaged"):
-        read_record(row, {})
+def test_equal_conditions_have_no_remark() -> None:
+    assert other_conditions(question(), question(seed=3)) == ()
 
 
-def test_equal_worlds_have_no_remark() -> None:
-    assert world_apart(question(), question(seed=3)) == ()
-
-
-def figures(answered: Evaluation, unseen: Unseen | None = None) -> dict[str, Any]:
+def result(answered: Evaluation, unseen: Unseen | None = None) -> Result:
     known = {"00000-t1": {ONE, OTHER}, "00001-t1": {ONE, THIRD, OTHER}}
-    ceiling = Ceiling({(name, (2, 1, 0, 0)): frozenset(layouts) for name, layouts in known.items()})
-    (result,) = results_of([Line(ROW, answered, question())], ceiling, unseen)
-    return result.figures
+    limit = DiversityLimit({(name, (2, 1, 0, 0)): frozenset(layouts) for name, layouts in known.items()})
+    return result_of(ROW, answered, question(), limit, unseen)
 
 
-def test_the_figures_of_a_known_answer(answered: Evaluation) -> None:
-    some = figures(answered)[ALL]
-    values = {name: estimate and estimate.value for name, estimate in some.metrics.items()}
-    assert set(values) == set(METRICS)
+def value(estimate: Estimate | None) -> float:
+    assert estimate is not None
+    return estimate.value
+
+
+def test_the_metrics_of_a_known_answer(answered: Evaluation) -> None:
+    found = result(answered)
+    values = {name: value(estimate) for name, estimate in found.metrics[ALL].items()}
+    assert set(values) == {*METRICS, "diversity_limit", "of_diversity_limit", "beyond_diversity_limit"}
     assert values["stability"] == pytest.approx(5 / 6) and values["front_iou"] == pytest.approx((4 * 0.9 + 0.5) / 6)
     assert values["side_iou"] == pytest.approx(values["front_iou"] / 2)
     assert values["top_iou"] == pytest.approx(values["front_iou"] / 4)
     assert values["diversity"] == pytest.approx(2 / 3)
     assert values["valid_diversity"] == pytest.approx((2 / 3 + 1 / 3) / 2)
     two, three = 2 / 3 * (1 - 1 / 8), 1 - (2 / 3) ** 3
-    assert some.ceiling is not None and some.ceiling.value == pytest.approx((two + three) / 2)
-    assert some.of_ceiling is not None and some.of_ceiling.value == pytest.approx(1 / (two + three))
-    assert some.ceiling_scenes == 2
-    assert some.outside is not None and some.outside.value == 0
+    assert values["diversity_limit"] == pytest.approx((two + three) / 2)
+    assert values["of_diversity_limit"] == pytest.approx(1 / (two + three))
+    assert found.limit_scenes[ALL] == 2 and values["beyond_diversity_limit"] == 0
 
 
 def test_valid_samples_of_other_layouts_are_counted(answered: Evaluation) -> None:
-    ceiling = Ceiling({("00000-t1", (2, 1, 0, 0)): frozenset([OTHER])})
-    outside = ceiling.outside(answered)
-    assert outside is not None and outside.value == pytest.approx(2 / 3)
-    assert Ceiling({("00000-t1", (1, 1, 0, 0)): frozenset([ONE])}).share(answered) is None  # of another list
+    limit = DiversityLimit({("00000-t1", (2, 1, 0, 0)): frozenset([OTHER])})
+    assert value(limit.estimates(answered)[1]["beyond_diversity_limit"]) == pytest.approx(2 / 3)
+    of_another_list = DiversityLimit({("00000-t1", (1, 1, 0, 0)): frozenset([ONE])})
+    assert of_another_list.estimates(answered) == (0, {})
 
 
 def test_one_sample_has_no_diversity(answered: Evaluation) -> None:
-    alone = replace(answered, num_samples=1)
-    some = figures(alone)[ALL]
-    assert some.metrics["diversity"] is None and some.metrics["valid_diversity"] is None and some.of_ceiling is None
+    found = result(replace(answered, num_samples=1)).metrics[ALL]
+    assert found["diversity"] is None and found["valid_diversity"] is None and "of_diversity_limit" not in found
 
 
 def test_unseen_scenes_are_counted_on_their_own(answered: Evaluation) -> None:
     unseen = Unseen(("base",), frozenset(["x"]), {"designs": frozenset(["00001-t1"]), "layouts": frozenset()})
-    found = figures(answered, unseen)
-    assert set(found) == {ALL, "designs"}
-    stability = found["designs"].metrics["stability"]
-    assert found["designs"].scenes == 1 and stability is not None and stability.value == pytest.approx(2 / 3)
+    found = result(answered, unseen)
+    assert set(found.metrics) == {ALL, "designs"} and found.scenes == {ALL: 2, "designs": 1}
+    assert value(found.metrics["designs"]["stability"]) == pytest.approx(2 / 3) and not found.remark
+    elsewhere = replace(answered, facts={"trained_on": {"name": "mine", "sha256": "y"}})
+    assert result(elsewhere, unseen).remark.startswith("trained on mine")
 
 
 def test_what_ships_says_which_scenes_training_has_not_seen() -> None:
@@ -206,21 +204,23 @@ def test_what_ships_says_which_scenes_training_has_not_seen() -> None:
     assert found.scenes["layouts"] < found.scenes["designs"]  # who knows a design knows its layout
     with pytest.raises(StackgenError, match="another test set"):
         read_unseen("else")
+    limit = json.loads(LIMIT_FILE.read_text())["figures"]
+    assert read_diversity_limit(LIMIT_FILE, data["test_set"], limit["physics"]).layouts
     with pytest.raises(StackgenError, match="knows the training sets"):
         read_unseen(data["test_set"], ["unheard-of"])
 
 
-def test_a_ceiling_of_another_world_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "ceiling.json"
+def test_a_diversity_limit_under_other_conditions_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "limit.json"
     part = {"scenes": [{"scene": "00000-t1", "counts": [2, 1, 0, 0], "valid": [format_layout(ONE)]}]}
     path.write_text(json.dumps({"figures": {"test_set": "t", "physics": PHYSICS, "lists": {TRUE_LIST: part}}}))
-    assert read_ceiling(path, "t", PHYSICS).layouts == {("00000-t1", (2, 1, 0, 0)): frozenset([ONE])}
+    assert read_diversity_limit(path, "t", PHYSICS).layouts == {("00000-t1", (2, 1, 0, 0)): frozenset([ONE])}
     for test_set, physics in (("u", PHYSICS), ("t", {**PHYSICS, "friction": 0.4})):
         with pytest.raises(StackgenError, match="another test set or other physics"):
-            read_ceiling(path, test_set, physics)
+            read_diversity_limit(path, test_set, physics)
     path.write_text("{}")
     with pytest.raises(StackgenError, match="damaged"):
-        read_ceiling(path, "t", PHYSICS)
+        read_diversity_limit(path, "t", PHYSICS)
 
 
 @pytest.mark.parametrize("layout", [ONE, ((), (), (), ()), ((10, 2), (), (3,), ())])
@@ -239,70 +239,44 @@ def test_examples_are_successes_and_failures_of_distinct_scenes(answered: Evalua
 
 
 @pytest.mark.parametrize(
-    "rows", [[], [ROW, ROW], [replace(ROW, name="?")], [replace(ROW, model={})], [replace(ROW, paper="Else")]]
+    "rows", [[], [ROW, ROW], [replace(ROW, name="?")], [replace(ROW, kind="verified")], [replace(ROW, paper="Else")]]
 )
 def test_rows_that_say_nothing_are_one_line(rows: list[Row]) -> None:
     with pytest.raises(StackgenError, match=r"^report: "):
         check_rows(rows)
 
 
-WORLD = World(("towers", "0123456789abcdef"), 2, 2, 3, 0, PHYSICS, "0.1.0", "a machine")
+CONDITIONS = Conditions(("towers", "0123456789abcdef"), 2, 2, 3, 0, PHYSICS, "0.1.0", "a machine")
 
 
-def test_tables_hold_every_row_in_the_section_of_its_kind(answered: Evaluation) -> None:
+def test_tables_hold_every_row_in_the_section_of_its_kind(answered: Evaluation, tmp_path: Path) -> None:
     verified = replace(ROW, name="Verified one", kind="verified", paper=None, note="Eight draws.")
-    other = replace(answered, facts={"weights": "a", "sampling_s": 60.0, "judging_s": 30.0})
+    other = replace(answered, checking_seconds=88.5)
     training = Training("The data", "stackgen generate --config x.yaml", 1.5, "a machine")
-    lines = [Line(ROW, answered, question(), True, ("other physics",)), Line(verified, other, question())]
-    results = results_of(lines, None, None)
-    text = to_markdown(results, WORLD, None, ["![a](a.png)"], [training])
+    plain, chosen = (result_of(row, some, question(), None, None) for row, some in ((ROW, answered), (verified, other)))
+    results = [replace(plain, remark="on other data"), chosen]
+    text = to_markdown(results, CONDITIONS, None, ["![a](a.png)"], [training])
     one_shot, _, rest = text.partition("## Verified")
-    assert "| A method † | CNN's |" in one_shot and "Verified one" not in one_shot
-    assert "| Verified one | CNN's |" in rest and "Eight draws." in rest and "other physics" in rest
+    assert "| A method | CNN's |" in one_shot and "Verified one" not in one_shot
+    assert "| Verified one | CNN's |" in rest and "Eight draws." in rest and "on other data" in rest
     assert "*85.20*" in one_shot and "take 1.5 minutes" in rest and training.command in rest
     assert "83.3 (66.7 to 100.0)" in one_shot  # stability: two scenes
-    rows = list(csv.DictReader(io.StringIO(to_csv(results))))
+    write_csv(tmp_path / "table.csv", csv_rows(results))
+    rows = list(csv.DictReader(io.StringIO((tmp_path / "table.csv").read_text())))
     assert [row["method"] for row in rows] == ["A method", "Verified one"]
     assert float(rows[0]["stability"]) == pytest.approx(83.3333) and rows[0]["stability_paper"] == "85.2"
     assert rows[1]["stability_paper"] == "" and rows[1]["number_of_scenes"] == "2"
-    plain = json.loads(json.dumps(to_json(results, WORLD, None, [training]), allow_nan=False))
-    first = plain["rows"][0]
-    assert first["recorded"] and set(first["paper_percent"]) == set(PAPER_COLUMNS)
-    assert first["figures"]["all"]["metrics"]["stability"]["value"] == pytest.approx(5 / 6)
+    first = json.loads(json.dumps(to_json(results, CONDITIONS, None, [training]), allow_nan=False))["rows"][0]
+    assert first["remark"] == "on other data" and set(first["paper_percent"]) == set(PAPER_COLUMNS)
+    assert first["metrics"]["all"]["stability"]["value"] == pytest.approx(5 / 6)
 
 
 def test_a_chart_is_the_same_twice(answered: Evaluation, tmp_path: Path) -> None:
-    results = results_of([Line(ROW, answered, question())], None, None)
+    results = [result_of(ROW, answered, question(), None, None)]
     names = []
     for folder in (tmp_path / "a", tmp_path / "b"):
-        folder.mkdir()
         names = draw_charts(results, folder)
     files = sorted(path.name for path in (tmp_path / "a").iterdir())
     assert len(files) == len(names) == 4
     for name in files:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-
-
-def test_a_sampler_is_known_by_its_weights_and_settings(tiny: TinyWeights) -> None:
-    def identity(**options: Any) -> str:
-        row = Row("a", {"weights": str(tiny.sampler), **options})
-        return key_of(sampler_identity(plan.under_test(row, plan.ReportSettings(rows=[row]))))
-
-    same = [identity(), identity(block_list_weights=str(tiny.predictor))]
-    others = [
-        identity(sampler={"steps": 8}),
-        identity(sampler={"kind": "ddim"}),
-        identity(verify="statics", draws=8),
-        identity(verify="statics", draws=9),
-        identity(weights="random-placement"),
-        identity(weights="greedy-random"),
-    ]
-    assert len(set(same)) == 1 and len({*same, *others}) == 1 + len(others)
-
-
-def test_a_heuristic_is_the_same_by_name_and_by_class() -> None:
-    named = {"weights": "random-placement"}
-    built = {"weights": {"class_path": "stackgen.baselines.random_placement.RandomPlacement"}}
-    rows = [Row("a", model) for model in (named, built)]
-    a, b = (sampler_identity(plan.under_test(row, plan.ReportSettings(rows=rows))) for row in rows)
-    assert a == b
