@@ -11,6 +11,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +19,7 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import centers_of_mass
 from stackgen.protocols import Verdict
 from stackgen.sim.physics import Physics
-from stackgen.sim.statics.contacts import GROUND, Contact, distance, find_contacts, hull
+from stackgen.sim.statics.contacts import GROUND, Contact, find_contacts
 from stackgen.sim.statics.programs import Statics
 from stackgen.stack import Stack
 
@@ -148,8 +149,8 @@ def _reason(block: int, center: Floats, found: StaticsAnswer, slides: bool) -> s
         return f"loses its support, block {' and '.join(map(str, below))}"
     if slides:
         return "would slide"
-    corners = np.concatenate([contact.points for contact in supports])
-    beside = distance((center[0], center[1]), hull([(x, y) for x, y, _ in corners.tolist()]))
+    corners = np.concatenate([contact.points for contact in supports])[:, :2].astype(np.float32)
+    beside = -cv2.pointPolygonTest(cv2.convexHull(corners), (float(center[0]), float(center[1])), measureDist=True)
     if beside > 0.005:  # what two decimals would show as 0.00 is not the reason
         return f"centre of mass {beside:.2f} cells beside its support"
     return "is tipped over by what it carries"

@@ -11,7 +11,6 @@ fewer repeat their first. Lengths in cells.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -352,22 +351,6 @@ def clip(polygon: list[Point], window: list[Point]) -> list[Point]:
         if not polygon:
             return []
     return _distinct(polygon)
-
-
-def distance(point: Point, polygon: list[Point]) -> float:
-    """Return how far a point lies outside a convex counter-clockwise polygon, which may be a point or a line.
-
-    >>> distance((2, 0.5), [(0, 0), (1, 0), (1, 1), (0, 1)])
-    1.0
-    """
-    x, y = point
-    inside, nearest = len(polygon) > 2, math.inf
-    for (ax, ay), (bx, by) in zip(polygon, polygon[1:] + polygon[:1], strict=True):
-        ex, ey = bx - ax, by - ay
-        inside &= ex * (y - ay) - ey * (x - ax) >= 0
-        along = min(max((ex * (x - ax) + ey * (y - ay)) / (ex * ex + ey * ey or 1), 0), 1)
-        nearest = min(nearest, math.hypot(x - ax - along * ex, y - ay - along * ey))
-    return 0.0 if inside else nearest
 
 
 def _distinct(polygon: list[Point]) -> list[Point]:

@@ -113,7 +113,7 @@ def test_margins_that_make_no_sense_are_named() -> None:
 # Laws.
 
 
-def test_a_part_is_judged_as_if_it_were_the_whole() -> None:
+def test_the_answer_for_a_part_is_that_for_the_part_alone() -> None:
     rng = np.random.default_rng(1)
     seen = set()
     for stack in designs(25):
