@@ -19,7 +19,7 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette
 from stackgen.protocols import StabilityChecker, Verdict
 from stackgen.stack import Stack, shapes_of
-from stackgen.training.callbacks import EMA, RAW_WEIGHTS, Compile, SampleQuality, Throughput
+from stackgen.training.callbacks import EMA, RAW_WEIGHTS, Compile, SampleQuality, StepMetrics, Throughput
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Mask
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -272,6 +272,16 @@ def test_throughput_counts_the_samples_of_training(tmp_path: Path) -> None:
     trainer = trainer_for(tmp_path, [Throughput(every_n_steps=4)])
     trainer.fit(Module(), batches(9))
     assert float(trainer.callback_metrics["train/samples_per_second"]) > 3
+
+
+def test_the_norm_is_that_of_all_gradients_before_they_are_clipped(tmp_path: Path) -> None:
+    trainer = trainer_for(tmp_path, [StepMetrics(every_n_steps=1)], gradient_clip_val=0.1)
+    trainer.fit(Module(), batches(3))
+    figures = trainer.callback_metrics
+    assert float(figures["train/gradient_norm"]) == pytest.approx(2**0.5)  # of a loss -(w1 + w2)
+    assert float(figures["train/learning_rate"]) == 1.0
+    with pytest.raises(StackgenError, match="at least 1"):
+        StepMetrics(0)
 
 
 def test_callbacks_and_metrics_import_no_simulator() -> None:
