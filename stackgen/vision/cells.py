@@ -84,7 +84,7 @@ def occupancy(silhouette: Mask, grid: Grid) -> Ints:
 
 
 def _window(grid: Grid, row: int, column: int) -> tuple[slice, slice]:
-    """The pixels of a cell."""
+    """Return the rows and columns of a cell's pixels."""
     scale = grid.pixels_per_cell
     left = grid.image_size / 2 + (column - grid.width / 2) * scale
     bottom = grid.image_size - grid.ground_margin - row * scale

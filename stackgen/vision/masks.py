@@ -12,7 +12,7 @@ from stackgen.world import Mask
 
 
 def bounding_box(mask: Mask) -> tuple[slice, slice]:
-    """Rows and columns of the smallest box around what is set; empty where nothing is."""
+    """Return rows and columns of the smallest box around what is set; empty where nothing is."""
     import cv2
 
     left, top, width, height = cv2.boundingRect(mask.astype(np.uint8))

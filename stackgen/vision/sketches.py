@@ -100,6 +100,7 @@ def _sketch(photo: Picture, grid: Grid) -> Sketch:
 
 
 def _scaled(picture: Picture) -> Picture:
+    """Bring a photo to `WORK_SIZE`."""
     if min(picture.shape[:2]) < 64:
         raise StackgenError(f"the photo is only {picture.shape[1]} x {picture.shape[0]} pixels; take a larger one")
     factor = WORK_SIZE / max(picture.shape[:2])

@@ -101,7 +101,7 @@ def fill_nearest(
 
 
 def _covered(shape: tuple[int, ...], polygon: Floats) -> tuple[slice, slice, NDArray[np.bool_]] | None:
-    """The window around a convex polygon and which of its pixels have their centre inside; None if off-screen."""
+    """Find the window around a convex polygon and its pixels whose centre is inside; None if it is off-screen."""
     (left, top), (right, bottom) = polygon.min(axis=0), polygon.max(axis=0)
     x0, x1 = (int(np.clip(np.ceil(v - 0.5), 0, shape[1])) for v in (left, right))
     y0, y1 = (int(np.clip(np.ceil(v - 0.5), 0, shape[0])) for v in (top, bottom))

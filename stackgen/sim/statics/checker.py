@@ -141,6 +141,7 @@ _GLUE = 10.0
 
 
 def _reason(block: int, center: Floats, found: StaticsAnswer, slides: bool) -> str:
+    """Say why one block is not held; `slides` tells that friction without limit would hold it."""
     supports = [contact for contact in found.contacts if contact.supports(block)]
     if not supports:
         return "hangs in the air"

@@ -185,6 +185,7 @@ def _extent(coordinates: Floats, of: NDArray[np.bool_]) -> tuple[Floats, Floats]
 
 
 def _on_ground(bodies: _Bodies, tolerance: float) -> list[Contact]:
+    """Find the patches between blocks and the ground."""
     blocks = np.flatnonzero(bodies.vertices[..., 2].min(axis=1, initial=np.inf) <= tolerance)
     points, near = _slice(bodies.vertices[blocks], bodies.edges[blocks], bodies.vertices[blocks][..., 2], tolerance)
     up, contacts = np.array([0.0, 0.0, 1.0]), []
@@ -199,6 +200,7 @@ def _on_ground(bodies: _Bodies, tolerance: float) -> list[Contact]:
 
 
 def _between(bodies: _Bodies, tolerance: float) -> list[Contact]:
+    """Find the patches between blocks."""
     owner, face, other = _touching_faces(bodies, tolerance, min(tolerance, SIDE))
     normals = bodies.normals[owner, face]  # (P, 3)
     corners = np.take_along_axis(bodies.vertices[owner], bodies.corners[owner, face][..., None], axis=1)  # (P, C, 3)
@@ -258,6 +260,7 @@ def _slice(vertices: Floats, edges: Ints, heights: Floats, tolerance: float) -> 
 
 
 def _place(stack: Stack) -> _Bodies:
+    """Move the shapes of a stack to their poses."""
     molds = _cast(stack.catalogue)
     rotation = rotation_matrices(stack.poses[:, 3:]).transpose(0, 2, 1)
     vertices = molds.vertices[stack.shapes] @ rotation + stack.poses[:, None, :3]
@@ -269,6 +272,7 @@ def _place(stack: Stack) -> _Bodies:
 
 @lru_cache(maxsize=8)
 def _cast(catalogue: Catalogue) -> _Molds:
+    """Collect the shapes of a catalogue as arrays of equal size."""
     parts = [_features(shape) for shape in catalogue]
     vertices, normals, corners, edges = (
         [_padded(part[i], max(len(p[i]) for p in parts)) for part in parts] for i in range(4)

@@ -5,7 +5,7 @@ is known once for the whole stack, and each part of it is the same small problem
 left out: are there forces that only push, act inside the contacts and stay in the friction cones, and
 that cancel every weight? There are three answers:
 
-- **stands**: yes, even with contacts narrowed at both ends, half of the friction, and a pull to either
+- **stands**: yes, even with contacts narrowed at both ends, a fifth of the friction, and a pull to either
   side. A margin on each makes up for what statics cannot know (how a load divides between supports) and
   for what moves a little when a block is taken out.
 - **falls**: no, even with contacts widened, more friction, neighbours nearby as props, and gaps closed.
