@@ -140,7 +140,7 @@ class Command:
             self._shorten_help(parser)
         values = parse(parser, self.verb, own_sections(self.verb, argv))
         values.pop("config", None)
-        text = parser.dump(values, skip_none=False) if self.config else ""
+        text = parser.dump(values, skip_unset=False) if self.config else ""
         options = vars(parser.instantiate(values))
         if self.config:
             options[self.config] = text

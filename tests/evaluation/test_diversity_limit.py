@@ -17,6 +17,7 @@ from stackgen.geometry import silhouette
 from stackgen.protocols import StabilityChecker, Verdict
 from stackgen.sampling.feasible import can_make, layout
 from stackgen.sim.checkers import SimulatorChecker
+from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Grid, Mask, Shape, World
 from stackgen.world import Catalogue as Shapes
@@ -135,6 +136,8 @@ def test_shapes_of_another_height_are_refused_in_one_line() -> None:
 
 class Says(StabilityChecker):
     """A checker that says the same of all stacks, or asks for blocks off their cells; nothing moves."""
+
+    physics = Physics()
 
     def __init__(self, stable: bool = True, off_the_cells: bool = False, shift: float = 0.0) -> None:
         self.stable, self.off_the_cells, self.shift = stable, off_the_cells, shift

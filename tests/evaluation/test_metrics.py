@@ -108,7 +108,7 @@ def test_a_metric_is_its_reference_summed_in_any_parts(name: str) -> None:
 def test_the_views_are_averaged_where_they_have_a_target() -> None:
     scenes = random_scenes(40, seed=3)
     for view in ("side", "top"):
-        seen = [s.ious[view] for scene in scenes for s in scene.samples if view in s.ious]  # type: ignore[index]
+        seen = [s.ious[view] for scene in scenes for s in scene.samples if view in s.ious]
         parts = [METRICS[f"{view}_iou"](scene) for scene in scenes]
         assert sum(p[0] for p in parts) == pytest.approx(sum(seen)) and sum(p[1] for p in parts) == len(seen)
 
