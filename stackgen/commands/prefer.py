@@ -39,7 +39,7 @@ def main(
     """
     from stackgen.data.dataset import Dataset
     from stackgen.data.preferences import prefer
-    from stackgen.evaluation.protocol import ParallelChecker
+    from stackgen.evaluation.parallel import ParallelChecker
     from stackgen.sampling.methods import load_sampler
     from stackgen.sim.checkers import SimulatorChecker
 
@@ -50,7 +50,7 @@ def main(
     train = Dataset.open(data).split("train")
     sampler = load_sampler(weights)
     chosen = np.random.default_rng(seed).choice(len(train), min(scenes, len(train)), replace=False)
-    factory = partial(SimulatorChecker, catalogue=sampler.world.catalogue, until_fall=True)
+    factory = partial(SimulatorChecker, until_fall=True)
     with (
         ParallelChecker(factory, workers or cores()) as checker,
         progress_bar("scenes", len(chosen)) as (advance, _),
