@@ -16,7 +16,7 @@ class SilhouetteMLP(StackgenModule):
     kind = "silhouette-mlp"
 
     def __init__(self, width: int = 256, learning_rate: float = 1e-3) -> None:
-        super().__init__({"width": width}, OptimizerConfig(learning_rate=learning_rate))
+        super().__init__(OptimizerConfig(learning_rate=learning_rate), width=width)
 
     def make(self, world: World) -> nn.Module:
         return mlp(world.grid.image_size**2 + len(world.catalogue), self.config["width"], world.max_blocks * 6)

@@ -19,4 +19,4 @@ __all__ = ["HEURISTICS", "BruteForce", "GreedyRandom", "RandomPlacement", "TranR
 __getattr__, __dir__, _ = lazy_loader.attach(__name__, submod_attrs={"modules": ["TranReg", "TranVAE"]})
 
 HEURISTICS: dict[str, type[Heuristic]] = {kind.kind: kind for kind in (BruteForce, GreedyRandom, RandomPlacement)}
-"""By the name that stands for them where weights are asked for; there they have their default settings."""
+"""Heuristics by name; wherever weights are asked for, the name stands for one with its default settings."""

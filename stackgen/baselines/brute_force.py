@@ -63,15 +63,15 @@ class BruteForce(Heuristic):
                 "step positive and penalty not negative"
             )
 
-    def place(self, silhouette: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
+    def place(self, silhouette: Mask, block_list: NDArray[np.int64], rng: np.random.Generator) -> Stack:
         """Search a place for each block, then perhaps swap."""
-        return swap(self.search(silhouette, counts, rng), self.sigma, rng)
+        return swap(self.search(silhouette, block_list, rng), self.sigma, rng)
 
-    def search(self, silhouette: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
+    def search(self, silhouette: Mask, block_list: NDArray[np.int64], rng: np.random.Generator) -> Stack:
         """Make the stack before the swap."""
         target = running_sums(silhouette)
         taken = np.zeros(silhouette.shape, dtype=np.int64)  # (H, W) number of blocks on each pixel
-        shapes, poses = self._largest_first(counts), []
+        shapes, poses = self._largest_first(block_list), []
         for shape in shapes:
             x, level = self.best(shape, *self.candidates(rng), silhouette, target, taken)
             poses.append([x, 0, level + 0.5, 0, 0, 0])

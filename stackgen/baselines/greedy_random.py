@@ -50,14 +50,14 @@ class GreedyRandom(Heuristic):
     def _sections(self) -> list[float]:
         return [section(shape) for shape in self.world.catalogue]
 
-    def place(self, silhouette: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
+    def place(self, silhouette: Mask, block_list: NDArray[np.int64], rng: np.random.Generator) -> Stack:
         """Fill the silhouette, perhaps swap, and lay down what is left."""
-        structure, left = self.fill(silhouette, counts)
+        structure, left = self.fill(silhouette, block_list)
         return self._with_the_rest(swap(structure, self.sigma, rng), left)
 
-    def fill(self, silhouette: Mask, counts: NDArray[np.int64]) -> tuple[Stack, NDArray[np.int64]]:
+    def fill(self, silhouette: Mask, block_list: NDArray[np.int64]) -> tuple[Stack, NDArray[np.int64]]:
         """Make the structure, and the block list (S,) of what fits nowhere."""
-        left = counts.copy()
+        left = block_list.copy()
         shapes: list[int] = []
         poses: list[list[float]] = []
         for level in range(self.world.grid.height):

@@ -40,7 +40,7 @@ class Heuristic(ABC):
     world: World = PAPER_WORLD
 
     @abstractmethod
-    def place(self, silhouette: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
+    def place(self, silhouette: Mask, block_list: NDArray[np.int64], rng: np.random.Generator) -> Stack:
         """Make one stack for a silhouette (H, W) and a block list (S,)."""
 
     @property
@@ -75,21 +75,21 @@ class Heuristic(ABC):
             if used and abs(shape.size[2] - 1) > 1e-6:
                 raise StackgenError(f"{self.kind} places shapes one cell high, not {shape.name!r}")
         scenes = []
-        for picture, list_ in zip(np.asarray(silhouettes, dtype=bool), np.asarray(counts), strict=True):
-            check_block_list(list_, self.world.max_blocks)
-            streams = (random_stream(seed, picture, list_, number) for number in range(num_samples))
-            scenes.append([self.place(picture, list_, rng) for rng in streams])
+        for picture, block_list in zip(np.asarray(silhouettes, dtype=bool), np.asarray(counts), strict=True):
+            check_block_list(block_list, self.world.max_blocks)
+            streams = (random_stream(seed, picture, block_list, number) for number in range(num_samples))
+            scenes.append([self.place(picture, block_list, rng) for rng in streams])
         return scenes
 
-    def _largest_first(self, counts: NDArray[np.int64]) -> list[int]:
+    def _largest_first(self, block_list: NDArray[np.int64]) -> list[int]:
         """List the shape index of each block, the ones of most area first."""
-        order = sorted(range(len(counts)), key=lambda s: (-self.world.catalogue[s].volume, s))
-        return [s for s in order for _ in range(int(counts[s]))]
+        order = sorted(range(len(block_list)), key=lambda s: (-self.world.catalogue[s].volume, s))
+        return [s for s in order for _ in range(int(block_list[s]))]
 
 
-def random_stream(seed: int, silhouette: Mask, counts: NDArray[np.int64], number: int) -> np.random.Generator:
+def random_stream(seed: int, silhouette: Mask, block_list: NDArray[np.int64], number: int) -> np.random.Generator:
     """Make the random numbers of one sample of one scene."""
-    content = np.packbits(silhouette).tobytes() + np.asarray(counts, dtype="<i8").tobytes()
+    content = np.packbits(silhouette).tobytes() + np.asarray(block_list, dtype="<i8").tobytes()
     scene = int.from_bytes(hashlib.sha256(content).digest()[:16], "little")
     return np.random.default_rng([seed, scene, number])
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 import torch
 from torch import Tensor
 
@@ -13,28 +11,27 @@ from stackgen.baselines.tran_vae import TranVAENetwork, VAEConfig
 from stackgen.models.module import PoseModule
 from stackgen.models.optimization import OptimizerConfig
 from stackgen.models.transformer import TransformerConfig
-from stackgen.world import World
 
 Parts = dict[str, Tensor]
 """Terms of a loss by name, each a scalar, to be logged beside it."""
 
 
 class PoseBaseline(PoseModule):
-    """A LightningModule around a PoseRegressor. A subclass sets `kind` and implements `make` and `_loss`."""
+    """A LightningModule around a PoseRegressor. A subclass sets `kind` and `network`, and implements `_loss`."""
 
     def _loss(self, batch: dict[str, Tensor], generator: torch.Generator | None = None) -> tuple[Tensor, Parts]:
-        """Mean loss of a batch, and its parts."""
+        """Compute the mean loss of a batch, and its parts."""
         raise NotImplementedError
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
-        """One step of the loss."""
+        """Compute the loss, and log its parts."""
         loss, parts = self._loss(batch, self.generator_of_step(index, batch["poses"].device))
         self.log("train/loss", loss, prog_bar=True)
         self.log_dict({f"train/{name}": part.detach() for name, part in parts.items()})
         return loss
 
     def validation_step(self, batch: dict[str, Tensor], index: int) -> None:
-        """The same loss on held-out stacks, with the same randomness every time."""
+        """Log the same loss on held-out stacks, with the same randomness every time."""
         generator = torch.Generator(device=batch["poses"].device).manual_seed(index)
         loss, parts = self._loss(batch, generator)
         size = len(batch["mask"])
@@ -48,11 +45,13 @@ class TranReg(PoseBaseline):
 
     Args:
         transformer: Architecture, that of the denoiser.
-        regression: How estimated poses are compared with the true ones.
+        regression: Comparison of the estimated poses with the true ones.
         optimizer: Learning rate and its course over the training.
     """
 
     kind = "tran-reg"
+    network = TranRegNetwork
+    model: TranRegNetwork
 
     def __init__(
         self,
@@ -60,13 +59,7 @@ class TranReg(PoseBaseline):
         regression: RegressionConfig = RegressionConfig(),  # noqa: B008
         optimizer: OptimizerConfig = OptimizerConfig(),  # noqa: B008
     ) -> None:
-        super().__init__({"transformer": asdict(transformer), "regression": asdict(regression)}, optimizer)
-        self._parts = (transformer, regression)
-        self.model: TranRegNetwork
-
-    def make(self, world: World) -> TranRegNetwork:
-        """See StackgenModule."""
-        return TranRegNetwork(*self._parts, world)
+        super().__init__(optimizer, transformer=transformer, regression=regression)
 
     def _loss(self, batch: dict[str, Tensor], generator: torch.Generator | None = None) -> tuple[Tensor, Parts]:
         return self.model.loss(batch, generator).mean(), {}
@@ -77,12 +70,14 @@ class TranVAE(PoseBaseline):
 
     Args:
         transformer: Architecture, that of the denoiser; its layers are shared by encoder and decoder.
-        regression: How reconstructed poses are compared with the true ones.
+        regression: Comparison of the reconstructed poses with the true ones.
         vae: Settings of the autoencoder.
         optimizer: Learning rate and its course over the training.
     """
 
     kind = "tran-vae"
+    network = TranVAENetwork
+    model: TranVAENetwork
 
     def __init__(
         self,
@@ -91,17 +86,10 @@ class TranVAE(PoseBaseline):
         vae: VAEConfig = VAEConfig(),  # noqa: B008
         optimizer: OptimizerConfig = OptimizerConfig(),  # noqa: B008
     ) -> None:
-        config = {"transformer": asdict(transformer), "regression": asdict(regression), "vae": asdict(vae)}
-        super().__init__(config, optimizer)
-        self._parts = (transformer, regression, vae)
-        self.model: TranVAENetwork
-
-    def make(self, world: World) -> TranVAENetwork:
-        """See StackgenModule."""
-        return TranVAENetwork(*self._parts, world)
+        super().__init__(optimizer, transformer=transformer, regression=regression, vae=vae)
 
     def _loss(self, batch: dict[str, Tensor], generator: torch.Generator | None = None) -> tuple[Tensor, Parts]:
-        """The error plus the weighted divergence; its weight rises in training, and is the last one elsewhere."""
+        """Add the weighted divergence to the error; its weight rises in training, and is the last one elsewhere."""
         error, divergence = (part.mean() for part in self.model.losses(batch, generator))
         vae = self.model.config
         weight = vae.weight(self.global_step) if self.training else vae.kl_weight

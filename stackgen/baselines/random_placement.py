@@ -27,9 +27,9 @@ class RandomPlacement(Heuristic):
 
     kind: ClassVar[str] = "random-placement"
 
-    def place(self, silhouette: Mask, counts: NDArray[np.int64], rng: np.random.Generator) -> Stack:
+    def place(self, silhouette: Mask, block_list: NDArray[np.int64], rng: np.random.Generator) -> Stack:
         """Make a legal stack of the block list; the silhouette is not looked at."""
-        shapes = rng.permutation(shapes_of(counts))
+        shapes = rng.permutation(shapes_of(block_list))
         layers: list[list[Interval]] = [[] for _ in range(self.world.grid.height)]  # the blocks' extents
         poses = []
         for shape in shapes:

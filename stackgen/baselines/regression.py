@@ -119,7 +119,7 @@ class PoseRegressor(PoseNetwork):
 
     Args:
         transformer: Architecture, that of the denoiser.
-        regression: How estimated poses are compared with the true ones.
+        regression: Comparison of the estimated poses with the true ones.
         world: Shapes, size of the silhouette, and N.
 
     Raises:
@@ -160,7 +160,7 @@ class PoseRegressor(PoseNetwork):
         return (self._distance(estimate, target) * mask).sum(-1) / mask.sum(-1)
 
     def _distance(self, a: Tensor, b: Tensor) -> Tensor:
-        """Mean over the six dimensions."""
+        """Average over the six dimensions."""
         difference = a - b
         return (difference.square() if self.regression.loss == "squared" else difference.abs()).mean(-1)
 

@@ -18,7 +18,7 @@ class TranRegNetwork(PoseRegressor):
 
     Args:
         transformer: Architecture, that of the denoiser.
-        regression: How estimated poses are compared with the true ones.
+        regression: Comparison of the estimated poses with the true ones.
         world: Shapes, size of the silhouette, and N.
     """
 

@@ -1,7 +1,7 @@
 """Tran-VAE's network: a conditional variational autoencoder of poses (paper, "Transformer-VAE Baseline").
 
-Two layers read a stack and say what its layout is, one latent vector (the posterior); four layers
-make poses of shapes, silhouette and latent vector. Without the stack, the latent vector is drawn
+Two layers read a stack and say what its layout is, in one latent vector (the posterior); four layers
+make poses of shapes, silhouette and latent vector. Without a stack, the latent vector is drawn
 from N(0, I). The paper gives the numbers of layers; latent size and weight of the divergence are ours.
 """
 
@@ -53,7 +53,7 @@ class TranVAENetwork(PoseRegressor):
 
     Args:
         transformer: Architecture, that of the denoiser; `layers` are those of encoder and decoder together.
-        regression: How reconstructed poses are compared with the true ones.
+        regression: Comparison of the reconstructed poses with the true ones.
         vae: Settings of the autoencoder.
         world: Shapes, size of the silhouette, and N.
 

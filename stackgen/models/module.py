@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict, is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
@@ -23,27 +24,29 @@ T = TypeVar("T")
 class StackgenModule(pl.LightningModule):
     """A LightningModule that learns its world from its data or a checkpoint, and builds its network then.
 
-    A subclass sets `kind` and implements `make`, `training_step` and `validation_step`. From `kind`, `config` and
-    `world` its network can be built again; see stackgen.models.weights.
+    A subclass sets `kind` and `network`, and implements `training_step` and `validation_step`. From `kind`, `config`
+    and `world` its network can be built again; see stackgen.models.weights.
 
     Args:
-        config: Description of the network, as JSON allows.
         optimizer: Learning rate and its course over the training.
+        parts: What describes the network: frozen dataclasses or plain values, in the order that `network` takes them.
     """
 
     kind: str
+    network: Callable[..., nn.Module]
     world: World
     model: nn.Module
 
-    def __init__(self, config: dict[str, Any], optimizer: OptimizerConfig = OptimizerConfig()) -> None:  # noqa: B008
+    def __init__(self, optimizer: OptimizerConfig = OptimizerConfig(), **parts: Any) -> None:  # noqa: B008 - frozen
         super().__init__()
-        self.config = config
+        self._parts = parts
+        self.config: dict[str, Any] = {n: asdict(p) if is_dataclass(p) else p for n, p in parts.items()}  # type: ignore[arg-type]
         self.optimizer_config = optimizer
         self.dataset: dict[str, Any] | None = None
 
     def make(self, world: World) -> nn.Module:
         """Make a new network for a world."""
-        raise NotImplementedError
+        return type(self).network(*self._parts.values(), world)
 
     def prepare(self, data: Any) -> None:
         """Take from the training data (a StackDataModule) what a new network needs; nothing by default."""
@@ -121,5 +124,5 @@ class PoseModule(StackgenModule):
         self.model.fit_normalization(*data.pose_statistics())
 
     def sampler(self) -> NetworkSampler:
-        """The model as a StackSampler, sharing its weights."""
+        """Make a StackSampler of the model, sharing its weights."""
         return self.wrapped(NetworkSampler)

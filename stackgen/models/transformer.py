@@ -31,13 +31,13 @@ class TransformerConfig:
         layers: Number of layers of the encoder (joint) or over the block tokens (cross).
         heads: Number of heads of each attention.
         feedforward: Width of the two-layer networks between attentions.
-        conditioning: How block tokens see the silhouette: `joint`, in one encoder with its tokens (paper), or
+        conditioning: Way in which block tokens see the silhouette: `joint`, in one encoder with its tokens (paper), or
             `cross`, by attention to a memory that is read once.
         memory_layers: Number of encoder layers over the silhouette alone; `cross` only.
         mask_padding: Whether padding tokens are kept out of attention; the paper leaves them in, as zero vectors.
         patch: Edge of a silhouette patch [pixel].
         stride: Distance between silhouette patches [pixel]; below `patch` they overlap.
-        dropout: Dropout rate in the encoder layers of `joint`.
+        dropout: Share of dropped activations in the encoder layers of `joint`.
         ordered: Whether the blocks of one shape are numbered, from the bottom up and left to right, and that
             number is embedded. The paper leaves equal blocks to their noise; then each must find out among all
             permutations which one it is.

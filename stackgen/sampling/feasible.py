@@ -37,7 +37,7 @@ displacement, settling, tilt and whole pixels do. Less than half the step betwee
 (0.5) and a cube, so that no run has two meanings."""
 
 
-def can_make(silhouette: ArrayLike, counts: ArrayLike, world: World) -> bool:
+def can_make(silhouette: ArrayLike, block_list: ArrayLike, world: World) -> bool:
     """Say whether a block list can make a silhouette, its blocks lying in rows of cells.
 
     At half height of each row the silhouette is cut into runs of pixels; the blocks of the list must
@@ -47,13 +47,13 @@ def can_make(silhouette: ArrayLike, counts: ArrayLike, world: World) -> bool:
 
     Args:
         silhouette: (H, W).
-        counts: (S,) block list.
+        block_list: (S,) number of blocks of each shape.
         world: Shapes, each one cell high, and grid.
 
     Raises:
         StackgenError: If a shape of the list is not one cell high.
     """
-    wanted = tuple(int(c) for c in np.asarray(counts))
+    wanted = tuple(int(c) for c in np.asarray(block_list))
     return wanted in lists_that_make(silhouette, wanted, world)
 
 

@@ -1,7 +1,7 @@
 """The last layer of the block-list network: features in, a distribution over block lists out.
 
-Two forms of it. `ClassHead` is the paper's: a class per multiset of shapes. There are 1,000 of them in
-the paper's world, 888,029 of 7 shapes and up to 20 blocks. `ChainHead` is ours for worlds of too many: it
+It has two forms. `ClassHead` is the paper's: a class for each multiset of shapes. There are 1,000 of them in
+the paper's world, and 888,029 of 7 shapes and up to 20 blocks. `ChainHead` is ours, for worlds of too many: it
 counts one shape after the other. Both are exact: their probabilities add up to one over all lists of
 1 to N blocks, and their best lists are the best of all that an inventory allows.
 
@@ -23,7 +23,7 @@ from stackgen.errors import StackgenError
 from stackgen.world import World
 
 MOST_CLASSES = 100_000
-"""Block lists that may still have a class each."""
+"""Largest number of block lists that have a class each."""
 
 _AT_ONCE = 32  # silhouettes whose best lists are searched together: bounds the memory
 
@@ -32,11 +32,12 @@ class ClassHead(nn.Linear):
     """Logits (B, classes) from features (B, F); class i stands for the block list `lists[i]`.
 
     Args:
-        features: F.
-        num_shapes, max_blocks: S and N; together they fix the classes.
+        features: Number of features F.
+        num_shapes: Number of shapes S.
+        max_blocks: Longest block list N; with S it fixes the classes.
 
     Raises:
-        StackgenError: If there are too many.
+        StackgenError: If there are too many classes.
     """
 
     lists: Tensor
@@ -50,11 +51,11 @@ class ClassHead(nn.Linear):
         self.register_buffer("keys", self._key(lists), persistent=False)
 
     def log_probabilities(self, features: Tensor, counts: Tensor) -> Tensor:
-        """Log-probability (B, M) of block lists (B, M, S)."""
+        """Compute the log-probability (B, M) of block lists (B, M, S)."""
         return self(features).log_softmax(-1).gather(1, self.classes(counts))
 
     def best(self, features: Tensor, top: int, limit: Tensor | None = None) -> Tensor:
-        """The most likely lists (B, top, S) with counts of at most `limit` (S,); fewer if there are fewer."""
+        """Find the most likely lists (B, top, S) with counts of at most `limit` (S,); fewer if there are fewer."""
         allowed = torch.ones_like(self.keys, dtype=torch.bool)
         if limit is not None:
             allowed = (self.lists <= limit).all(-1)
@@ -65,7 +66,7 @@ class ClassHead(nn.Linear):
         return self.lists[logits.topk(top).indices]
 
     def classes(self, counts: Tensor) -> Tensor:
-        """Class (...) of each block list (..., S).
+        """Find the class (...) of each block list (..., S).
 
         Raises:
             StackgenError: If a list is empty or has more than N blocks.
@@ -85,14 +86,14 @@ class ChainHead(nn.Module):
     make more than N blocks, and the empty list, are left out. A silhouette shows the area of its blocks
     almost exactly, so that is what the counts of different shapes must agree on. And because so little
     of the past is remembered, the best lists are found exactly, whatever an inventory allows. The largest
-    shapes come first: how many small ones there are follows from the area that is left. What a count
-    depends on at any area (`common`) is learnt first, then what is special to one.
+    shapes come first: how many small ones there are follows from the area that is left. The layer `common`
+    serves all areas and is learnt first; `special` adds what holds at one area.
 
     Args:
-        features: F.
-        sizes: (S,) area of each shape, in steps of at least 1.
-        max_blocks: N.
-        most: A, from which on areas are not told apart.
+        features: Number of features F.
+        sizes: (S,) area of each shape, whole and at least 1.
+        max_blocks: Longest block list N.
+        most: Area A from which on areas are not told apart.
     """
 
     order: Tensor
@@ -112,12 +113,12 @@ class ChainHead(nn.Module):
 
     @staticmethod
     def of_world(features: int, world: World) -> ChainHead:
-        """The head of a world, areas in steps of half a cell."""
+        """Make the head of a world, with areas in half cells."""
         sizes = [max(1, round(2 * shape.area)) for shape in world.catalogue]
         return ChainHead(features, sizes, world.max_blocks, 2 * world.grid.width * world.grid.height)
 
     def log_probabilities(self, features: Tensor, counts: Tensor) -> Tensor:
-        """Log-probability (B, M) of block lists (B, M, S).
+        """Compute the log-probability (B, M) of block lists (B, M, S).
 
         Raises:
             StackgenError: If a list is empty or has more than N blocks.
@@ -136,13 +137,13 @@ class ChainHead(nn.Module):
         return chosen[..., 0].sum(-1)
 
     def best(self, features: Tensor, top: int, limit: Tensor | None = None) -> Tensor:
-        """The most likely lists (B, top, S) with counts of at most `limit` (S,); fewer if there are fewer."""
+        """Find the most likely lists (B, top, S) with counts of at most `limit` (S,); fewer if there are fewer."""
         most = None if limit is None else limit[self.order]
         found = [self._best(part, top, most) for part in features.split(_AT_ONCE)]
         return torch.cat(found)[..., self.back]
 
     def _best(self, features: Tensor, top: int, limit: Tensor | None) -> Tensor:
-        """Forward search that keeps `top` beginnings, led by what the rest of each is worth at best.
+        """Search forward, keeping `top` beginnings, led by what the rest of each is worth at best.
 
         Each beginning is scored with its best completion, so one of the `top` best lists is never
         dropped: that would take `top` others that end better.
@@ -168,8 +169,8 @@ class ChainHead(nn.Module):
         return lists[:, :kept]
 
     def _steps(self, features: Tensor, limit: Tensor | None) -> tuple[list[Tensor], list[Tensor]]:
-        """For each shape: the log-probability (B, N + 1, A + 1, N + 1) of its count after so many blocks and
-        so much area, -inf where the limit forbids it; and what the rest is worth at best from there on
+        """Compute, for each shape, the log-probability (B, N + 1, A + 1, N + 1) of its count after so many blocks
+        and so much area, -inf where the limit forbids it; and what the rest is worth at best from there on
         (B, N + 1, A + 1), for the end too."""
         number = torch.arange(self.max_blocks + 1, device=features.device)
         blocks, areas = number[:, None, None], torch.arange(self.most + 1, device=features.device)[:, None]
@@ -193,13 +194,13 @@ class ChainHead(nn.Module):
         return steps, rest
 
     def _logits(self, features: Tensor) -> Tensor:
-        """Of each count of each shape, for each area so far: (B, S, A + 1, N + 1)."""
+        """Compute the logits of each count of each shape, for each area so far: (B, S, A + 1, N + 1)."""
         shapes = len(self.sizes)
         common = self.common(features).unflatten(1, (shapes, 1, -1))
         return (common + self.special(features).unflatten(1, (shapes, self.most + 1, -1))).float()
 
     def _possible(self, logits: Tensor, before: Tensor) -> Tensor:
-        """The logits (..., N + 1) without counts that make more than N blocks with those before (...)."""
+        """Mask the logits (..., N + 1) of counts that make more than N blocks with those before (...)."""
         number = torch.arange(self.max_blocks + 1, device=logits.device)
         return logits.masked_fill(before[..., None] + number > self.max_blocks, -torch.inf)
 
@@ -215,7 +216,7 @@ def _nothing_fits(max_blocks: int) -> StackgenError:
 
 
 def number_of_lists(num_shapes: int, max_blocks: int) -> int:
-    """How many block lists of 1..max_blocks blocks there are.
+    """Count the block lists of 1..max_blocks blocks.
 
     >>> number_of_lists(4, 10)
     1000
@@ -224,7 +225,7 @@ def number_of_lists(num_shapes: int, max_blocks: int) -> int:
 
 
 def all_block_lists(num_shapes: int, max_blocks: int) -> NDArray[np.int64]:
-    """(classes, S) every multiset of 1..max_blocks blocks, in lexicographic order.
+    """List every multiset of 1..max_blocks blocks (classes, S), in lexicographic order.
 
     Raises:
         StackgenError: If there are too many to be classes.

@@ -2,49 +2,42 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 from torch import Tensor
 
 from stackgen.models.block_list.network import BlockListNetwork, CNNConfig
 from stackgen.models.block_list.predictor import CNNPredictor
 from stackgen.models.module import StackgenModule
 from stackgen.models.optimization import OptimizerConfig
-from stackgen.world import World
 
 
 class BlockListCNN(StackgenModule):
-    """Predicts the block list from the silhouette: the true list's log-probability grows (paper, Eq. 5).
+    """The block-list CNN in training: it makes the true list's probability large (paper, Eq. 5).
 
     Args:
-        cnn: Architecture of the network.
+        cnn: Architecture of the CNN.
         optimizer: Learning rate and its course over the training.
     """
 
-    kind = "blocklist"
+    kind = "blocklist"  # one word, as in the cards of weights
+    network = BlockListNetwork
+    model: BlockListNetwork
 
     def __init__(
         self,
         cnn: CNNConfig = CNNConfig(),  # noqa: B008 - frozen
         optimizer: OptimizerConfig = OptimizerConfig(),  # noqa: B008
     ) -> None:
-        super().__init__({"cnn": asdict(cnn)}, optimizer)
-        self._cnn = cnn
-        self.model: BlockListNetwork
-
-    def make(self, world: World) -> BlockListNetwork:
-        """See StackgenModule."""
-        return BlockListNetwork(self._cnn, world)
+        super().__init__(optimizer, cnn=cnn)
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
-        """One step of the cross-entropy."""
+        """Compute the cross-entropy (paper, Eq. 5)."""
         features = self.model.features(batch["silhouette"])
         loss = self._loss(features, batch["counts"])
         self.log("train/loss", loss, prog_bar=True)
         return loss
 
     def validation_step(self, batch: dict[str, Tensor], index: int) -> None:
-        """Cross-entropy, exact match and top 3 on held-out stacks."""
+        """Log cross-entropy, exact match and top 3 on held-out stacks."""
         features, truth = self.model.features(batch["silhouette"]), batch["counts"]
         loss, hits = self._loss(features, truth), self._hits(features, truth)
         size = len(hits)
@@ -53,13 +46,13 @@ class BlockListCNN(StackgenModule):
         self.log_mean("validation/top3", hits.any(-1).float().mean(), size)
 
     def _loss(self, features: Tensor, truth: Tensor) -> Tensor:
-        """Mean cross-entropy of the true lists (B, S)."""
+        """Compute the mean cross-entropy of the true lists (B, S)."""
         return -self.model.out.log_probabilities(features, truth[:, None]).mean()
 
     def _hits(self, features: Tensor, truth: Tensor) -> Tensor:
-        """Whether each of the three best lists is the true one (B, 3)."""
+        """Say whether each of the three best lists is the true one (B, 3)."""
         return (self.model.out.best(features, 3) == truth[:, None]).all(-1)
 
     def predictor(self) -> CNNPredictor:
-        """The network as a BlockListPredictor, sharing its weights."""
+        """Make a BlockListPredictor of the network, sharing its weights."""
         return self.wrapped(CNNPredictor)

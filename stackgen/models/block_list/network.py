@@ -39,7 +39,7 @@ class BlockListNetwork(nn.Module):
 
     Args:
         config: Architecture.
-        world: Says which block lists there are, and the area that one can fill.
+        world: Block lists that there are, and the area that one can fill.
     """
 
     def __init__(self, config: CNNConfig, world: World) -> None:
@@ -66,7 +66,7 @@ class BlockListNetwork(nn.Module):
         return self.out.log_probabilities(self.features(silhouettes), counts)
 
     def best(self, silhouettes: Tensor, top: int, limit: Tensor | None = None) -> Tensor:
-        """The most likely block lists (B, top, S), see BlockListPredictor.predict."""
+        """Find the most likely block lists (B, top, S), see BlockListPredictor.predict."""
         return self.out.best(self.features(silhouettes), top, limit)
 
 

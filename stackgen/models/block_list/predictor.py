@@ -42,7 +42,7 @@ class CNNPredictor:
 
     @torch.inference_mode()
     def log_probabilities(self, silhouettes: Mask, lists: ArrayLike) -> NDArray[np.float64]:
-        """(B, M) natural logarithm of the probability of each of M block lists (M, S), for each silhouette.
+        """Compute the log-probability (B, M) [nat] of each of M block lists (M, S), for each silhouette.
 
         Raises:
             StackgenError: If a list has no block, or more than N.
@@ -52,13 +52,13 @@ class CNNPredictor:
         return torch.cat(parts).double().cpu().numpy()
 
     def _parts(self, silhouettes: Mask) -> list[Tensor]:
-        """The silhouettes (B, H, W) as the network takes them, in batches."""
+        """Split the silhouettes (B, H, W) into batches, as the network takes them."""
         device = self.network.hidden.weight.device
         parts = np.array_split(silhouettes, max(1, math.ceil(len(silhouettes) / 256)))
         return [torch.from_numpy(np.ascontiguousarray(part, dtype=np.float32)).to(device) for part in parts]
 
     def _lists(self, counts: ArrayLike, dimensions: int) -> Tensor:
-        """Counts (..., S) where the network is."""
+        """Put counts (..., S) where the network is."""
         array = np.asarray(counts, dtype=np.int64)
         if array.ndim != dimensions or array.shape[-1] != len(self.world.catalogue):
             names = ", ".join(self.world.catalogue.names)

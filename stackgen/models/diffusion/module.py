@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
-
 import torch
 from torch import Tensor
 
@@ -13,7 +11,6 @@ from stackgen.models.diffusion.schedules import ScheduleConfig
 from stackgen.models.module import PoseModule
 from stackgen.models.optimization import OptimizerConfig
 from stackgen.models.transformer import TransformerConfig
-from stackgen.world import World
 
 
 class DDPM(PoseModule):
@@ -28,6 +25,8 @@ class DDPM(PoseModule):
     """
 
     kind = "ddpm"
+    network = PoseDiffusion
+    model: PoseDiffusion
 
     def __init__(
         self,
@@ -37,18 +36,11 @@ class DDPM(PoseModule):
         optimizer: OptimizerConfig = OptimizerConfig(),  # noqa: B008
         draws: int = 1,
     ) -> None:
-        config = {"denoiser": asdict(denoiser), "schedule": asdict(schedule), "diffusion": asdict(diffusion)}
-        super().__init__(config, optimizer)
+        super().__init__(optimizer, denoiser=denoiser, schedule=schedule, diffusion=diffusion)
         self.draws = draws
-        self._parts = (denoiser, schedule, diffusion)
-        self.model: PoseDiffusion
-
-    def make(self, world: World) -> PoseDiffusion:
-        """See StackgenModule."""
-        return PoseDiffusion(*self._parts, world)
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
-        """One step of Eq. 3's loss, logged by quarter of the steps too."""
+        """Compute the loss of Eq. 3, and log it by quarter of the steps too."""
         generator = self.generator_of_step(index, batch["poses"].device)
         losses, t = self.model.loss(batch, self.draws, generator, self.model.config.drop_silhouette)
         loss = losses.mean()
@@ -58,7 +50,7 @@ class DDPM(PoseModule):
         return loss
 
     def validation_step(self, batch: dict[str, Tensor], index: int) -> None:
-        """The same loss on held-out stacks, with the same noise every time."""
+        """Log the same loss on held-out stacks, with the same noise every time."""
         generator = torch.Generator(device=batch["poses"].device).manual_seed(index)
         losses, t = self.model.loss(batch, 1, generator)
         self.log_mean("validation/loss", losses.mean(), len(losses), prog_bar=True)
@@ -71,9 +63,9 @@ class DDPM(PoseModule):
             if stage == "train" and len(part):
                 self.log(name, part.mean())
             elif stage != "train" and (len(part) or self.trainer.world_size > 1):
-                # Of several processes all say something, or one waits for ever.
+                # Every one of several processes must log, or the others wait for ever.
                 self.log_mean(name, part.sum() / max(1, len(part)), len(part))
 
     def sampler(self) -> DiffusionSampler:
-        """The model as a StackSampler, sharing its weights."""
+        """Make a StackSampler of the model, sharing its weights."""
         return self.wrapped(DiffusionSampler)

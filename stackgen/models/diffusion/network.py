@@ -23,7 +23,7 @@ class DiffusionConfig:
     """What is diffused and what the network estimates.
 
     Args:
-        prediction: What the network estimates: `epsilon`, the noise (paper), or `v` (Salimans & Ho 2022), which
+        prediction: Target of the network: `epsilon`, the noise (paper), or `v` (Salimans & Ho 2022), which
             weights the noisy steps, where the layout is decided, more.
         clip: Bound of the clean estimate while sampling, in standard deviations; null for none.
         least_std: Lower bound of the standard deviation that a dimension of the poses is divided by [cell, rad].
@@ -135,7 +135,7 @@ class PoseDiffusion(PoseNetwork):
         return found
 
     def _clean(self, x: Tensor, t: Tensor, estimate: Tensor) -> Tensor:
-        """The clean poses that an output of the network means, bounded as in the sampler."""
+        """Turn an output of the network into the clean poses it means, bounded as while sampling."""
         signal, sigma = self.schedule.signal_and_noise(t)
         clean = signal * x - sigma * estimate if self.config.prediction == "v" else (x - sigma * estimate) / signal
         return self._bounded(clean)

@@ -59,7 +59,7 @@ class VerdictTuning(DDPM):
             self._frozen[0].load_state_dict(self._loaded)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the copy with the weights."""
+        """Keep the copy beside the weights."""
         super().on_save_checkpoint(checkpoint)
         if self._frozen:
             checkpoint[_REFERENCE] = self._frozen[0].state_dict()
@@ -70,7 +70,7 @@ class VerdictTuning(DDPM):
         self._loaded = checkpoint.get(_REFERENCE)
 
     def training_step(self, batch: dict[str, Tensor], index: int) -> Tensor:
-        """The data's loss and the pairs'."""
+        """Add the loss of the pairs to that of the data."""
         data = super().training_step(batch, index)
         generator = self.generator_of_step(_OTHER + index, self.device)
         loss, right = self._preference_loss(generator)

@@ -103,7 +103,7 @@ def multistep(
 
 
 def _pairs(steps: Sequence[int]) -> Iterator[tuple[int, int]]:
-    """Each step with the one after it; 0 after the last."""
+    """Pair each step with the one after it; 0 comes after the last."""
     return zip(steps, [*steps[1:], 0], strict=True)
 
 
