@@ -19,7 +19,7 @@ from PIL import Image
 from stackgen.training.sweeps.coordinator import run_sweep
 from tests.conftest import CHILD, Cli
 from tests.training.sweeps.test_coordinator import PROGRAM, sweep_of
-from tests.training.test_plots import CURVES, TINY
+from tests.training.test_loggers import CURVES, TINY
 
 playwright = pytest.importorskip("playwright.sync_api", reason="drives the browser: pip install playwright")
 

@@ -171,7 +171,7 @@ def open_study(sweep: Sweep, folder: Path, seed: int = 0, parallel: int = 1) -> 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
     journal = folder / JOURNAL
-    # Optuna waits half a minute for a lock of its own that a killed process left; whoever holds the folder is alone.
+    # Optuna waits half a minute for a lock of its own that a killed process left; nobody else is at work here.
     for stale in folder.glob(f"{JOURNAL}.lock*"):
         stale.unlink(missing_ok=True)
     mend_journal(journal)

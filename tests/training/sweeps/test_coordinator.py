@@ -9,21 +9,16 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
-from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
 
 from stackgen.errors import StackgenError
-from stackgen.training.sweeps.child import command_of
 from stackgen.training.sweeps.coordinator import folder_lock, mend_journal, open_study, run_sweep
 from stackgen.training.sweeps.file import EarlyTerminate, Metric, Sweep
 from stackgen.training.sweeps.findings import ranking, write_findings
-from stackgen.training.sweeps.space import grid_of, space_of
-from stackgen.training.sweeps.telling import values_told
 from tests.conftest import CHILD, Cli
 
 ROOT = Path(__file__).parents[3]
@@ -73,47 +68,6 @@ def states(folder: Path, sweep: Sweep) -> list[str]:
 def starts(folder: Path) -> list[int]:
     """How often each trial's program was started."""
     return [len(path.read_text().split()) for path in sorted(folder.glob("trials/*/starts"))]
-
-
-def test_parameters_of_wandb_are_distributions_of_optuna() -> None:
-    found = space_of(
-        {
-            "a": {"values": [1, "x", True, None]},
-            "b": {"min": 1, "max": 5},
-            "c": {"min": 1.0, "max": 5},
-            "d": {"distribution": "log_uniform_values", "min": 0.01, "max": 1},
-            "e": {"distribution": "log_uniform", "min": 0, "max": 1},
-            "f": {"distribution": "q_uniform", "min": 0, "max": 1, "q": 0.25},
-            "g": {"parameters": {"h": {"distribution": "q_log_uniform_values", "min": 1, "max": 64}}},
-            "constant": {"value": 3},
-        }
-    )
-    assert found == {
-        "a": CategoricalDistribution([1, "x", True, None]),
-        "b": IntDistribution(1, 5),
-        "c": FloatDistribution(1, 5),
-        "d": FloatDistribution(0.01, 1, log=True),
-        "e": FloatDistribution(1, 2.718281828459045, log=True),
-        "f": FloatDistribution(0, 1, step=0.25),
-        "g.h": IntDistribution(1, 64, log=True),
-    }
-    assert grid_of({"f": found["f"], "b": found["b"]}) == {"f": [0, 0.25, 0.5, 0.75, 1], "b": [1, 2, 3, 4, 5]}
-
-
-@pytest.mark.parametrize(
-    ("parameter", "word"),
-    [
-        ({"vales": [1]}, "vales"),
-        ({"min": 1}, "give value, values, or min and max"),
-        ({"distribution": "beta", "min": 0, "max": 1}, "'beta' is not one of uniform"),
-        ({"distribution": "log_uniform_values", "min": 0, "max": 1}, "low"),
-        ({"values": [{"a": 1}]}, "as text"),
-        ({"distribution": "int_uniform", "min": 0.5, "max": 1}, "whole numbers"),
-    ],
-)
-def test_a_parameter_that_is_not_understood_is_named(parameter: dict[str, Any], word: str) -> None:
-    with pytest.raises(StackgenError, match=f"parameter x.*{word}"):
-        space_of({"x": parameter})
 
 
 def test_a_sweep_ends_with_the_best_configuration_and_pictures(
@@ -213,27 +167,6 @@ def test_a_journal_that_was_cut_off_is_mended(program: Path, tmp_path: Path) -> 
     assert states(tmp_path, sweep) == ["complete"] * 2
 
 
-def test_only_whole_lines_are_heard(tmp_path: Path) -> None:
-    told = tmp_path / "told"
-    assert values_told(told, "loss") == []
-    told.write_text('{"loss": 2}\nnoise\n[1]\n{"other": 1}\n{"lo')
-    assert values_told(told, "loss") == [2]
-    with told.open("a") as file:
-        file.write('ss": 1}\n')
-    assert values_told(told, "loss") == [2, 1]
-
-
-def test_the_macros_of_wandb_are_filled_in(program: Path, tmp_path: Path) -> None:
-    sweep = replace(sweep_of(program), command=["${env}", "${interpreter}", "a", "${args_no_hyphens}"])
-    assert command_of(sweep, {"x.y": 1, "z": None}, tmp_path) == [sys.executable, "a", "x.y=1", "z=null"]
-    fit = replace(sweep, command=["stackgen", "fit", "${args}"])
-    words = command_of(fit, {"x": True}, tmp_path)
-    assert words[:5] == [sys.executable, "-m", "stackgen", "fit", "--x=True"]
-    assert f"--trainer.default_root_dir={tmp_path}" in words
-    with pytest.raises(StackgenError, match="is not one of"):
-        command_of(replace(sweep, command=["${args_json}"]), {}, tmp_path)
-
-
 def test_without_optuna_the_help_and_the_export_work_and_a_sweep_names_the_extra(
     cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -249,24 +182,6 @@ def test_what_is_exported_is_the_file(cli: Cli) -> None:
     answer = cli("sweep", "--config", REAL, "--export_wandb")
     assert answer.code == 0, answer.err
     assert yaml.safe_load(answer.out) == yaml.safe_load(REAL.read_text())
-
-
-def test_every_parameter_of_the_real_sweep_is_an_option_of_fit(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(ROOT)
-    content = yaml.safe_load(REAL.read_text())
-    sweep = Sweep(**{**content, "metric": Metric(**content["metric"]), "early_terminate": EarlyTerminate(min_iter=1)})
-    space = space_of(sweep.parameters)
-    assert sweep.run_cap is not None and sweep.run_cap >= 30
-    values = {n: d.choices[-1] if isinstance(d, CategoricalDistribution) else d.low for n, d in space.items()}  # type: ignore[attr-defined]
-    words = command_of(sweep, values, tmp_path)
-    answer = cli(*words[3:], "--print_config")
-    assert answer.code == 0, answer.err
-    config = yaml.safe_load(answer.out)
-    assert config["model"]["init_args"]["schedule"]["kind"] == "cosine"
-    assert config["model"]["init_args"]["diffusion"]["guidance"] == 1.0
-    assert config["name"] == "run"
 
 
 @pytest.mark.slow

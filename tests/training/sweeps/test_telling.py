@@ -28,3 +28,13 @@ def test_a_sweep_is_told_after_each_validation(tmp_path: Path, monkeypatch: pyte
     assert [(line["step"], line["score"]) for line in lines] == [(2, 2), (4, 4), (6, 6)]
     assert torch.is_tensor(trainer.callback_metrics["score"])
     assert values_told(told, "score") == [2, 4, 6]
+
+
+def test_only_whole_lines_are_heard(tmp_path: Path) -> None:
+    told = tmp_path / "told"
+    assert values_told(told, "loss") == []
+    told.write_text('{"loss": 2}\nnoise\n[1]\n{"other": 1}\n{"lo')
+    assert values_told(told, "loss") == [2]
+    with told.open("a") as file:
+        file.write('ss": 1}\n')
+    assert values_told(told, "loss") == [2, 1]
