@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from benchmarks.common import argument_parser, plain_table, report, start
 
 if TYPE_CHECKING:
-    from stackgen.data.loading.arrays import StackArrays
+    from stackgen.data.arrays import StackArrays
     from stackgen.models.block_list.network import BlockListNetwork
 
 HEADS = ("classes", "chain")
@@ -25,10 +25,10 @@ def parser() -> argparse.ArgumentParser:
     options = argument_parser(__name__, __doc__)
     options.add_argument("--data", type=Path, default=Path("data/base.npz"), help="dataset folder or .npz")
     options.add_argument("--heads", nargs="+", choices=HEADS, default=list(HEADS))
-    options.add_argument("--steps", type=int, default=300, help="of training")
+    options.add_argument("--steps", type=int, default=300, help="steps of training")
     options.add_argument("--batch_size", type=int, default=128)
     options.add_argument("--number", type=int, default=1000, help="validation stacks")
-    options.add_argument("--seed", type=int, default=0, help="of the weights and the order of the stacks")
+    options.add_argument("--seed", type=int, default=0, help="seed of the weights and the order of the stacks")
     return options
 
 
@@ -38,9 +38,9 @@ def main() -> None:
     rows = [measure(options, head) for head in options.heads]
     cells = [[row["head"], *(_text(row[name]) for name in ("loss", "exact", "top3"))] for row in rows]
     headings = ("head", "cross-entropy", "exact match", "among the first 3")
-    figures = {"data": str(options.data), "steps": options.steps, "number": options.number, "seed": options.seed}
+    metrics = {"data": str(options.data), "steps": options.steps, "number": options.number, "seed": options.seed}
     title = f"Block lists after {options.steps} steps of {options.batch_size}, n = {options.number}"
-    report("block_list_heads", {**figures, "rows": rows}, [plain_table(title, headings, cells)], options.out)
+    report("block_list_heads", {**metrics, "rows": rows}, [plain_table(title, headings, cells)], options.out)
 
 
 def measure(options: argparse.Namespace, head: str) -> dict[str, Any]:
@@ -48,18 +48,16 @@ def measure(options: argparse.Namespace, head: str) -> dict[str, Any]:
     import numpy as np
     import torch
 
-    from stackgen.data.loading.arrays import load_dataset
+    from stackgen.data.dataset import Dataset
     from stackgen.evaluation.intervals import clustered_ratio
     from stackgen.models.block_list.network import BlockListNetwork, CNNConfig
-    from stackgen.world import Catalogue, Grid
 
-    splits, manifest = load_dataset(options.data, ("train", "validation"))
+    dataset = Dataset.open(options.data)
     torch.manual_seed(options.seed)
     small = CNNConfig(channels=24, layers=2, stem_stride=7, pool=5, hidden=128)
-    world = Catalogue.from_json(manifest["catalogue"]), manifest["max_blocks"], Grid(**manifest["grid"])
-    network = BlockListNetwork(replace(small, head=head), *world)  # type: ignore[arg-type]
-    train(network, splits["train"], options)
-    found = splits["validation"]
+    network = BlockListNetwork(replace(small, head=head), dataset.world)
+    train(network, dataset.split("train"), options)
+    found = dataset.split("validation")
     asked = found.select(np.linspace(0, len(found) - 1, options.number).astype(int))
     parts = [asked.batch(part) for part in np.array_split(np.arange(len(asked)), max(1, len(asked) // 250))]
     network.eval()
@@ -67,11 +65,11 @@ def measure(options: argparse.Namespace, head: str) -> dict[str, Any]:
         losses = [-network(part["silhouette"], part["counts"][:, None])[:, 0] for part in parts]
         hits = [(network.best(part["silhouette"], 3) == part["counts"][:, None]).all(-1) for part in parts]
     right = torch.cat(hits)
-    figures = {"loss": torch.cat(losses), "exact": right[:, 0], "top3": right.any(1)}
+    metrics = {"loss": torch.cat(losses), "exact": right[:, 0], "top3": right.any(1)}
     _, scene = np.unique(asked.template, return_inverse=True)
     estimates = {
         name: clustered_ratio(np.bincount(scene, values.double().numpy()), np.bincount(scene))
-        for name, values in figures.items()
+        for name, values in metrics.items()
     }
     return {"head": head, **{name: estimate and estimate.to_json() for name, estimate in estimates.items()}}
 

@@ -31,11 +31,11 @@ Question = tuple[Mask, NDArray[np.int64]]
 def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
-    options.add_argument("--scenes", type=int, default=500, help="of the test set")
+    options.add_argument("--scenes", type=int, default=500, help="scenes of the test set")
     options.add_argument("--num_samples", type=int, default=3, help="stacks for each scene and list")
     options.add_argument("--processes", type=int, default=1, help="that share the scenes")
     options.add_argument("--naive", type=int, default=3, help="scenes for the naive loop, one stack each; 0 for none")
-    options.add_argument("--block_list_weights", default="default", help="of the block-list network")
+    options.add_argument("--block_list_weights", default="default", help="weights of the block-list network")
     return options
 
 
@@ -43,16 +43,16 @@ def main() -> None:
     """Measure."""
     options = parser().parse_args()
     scenes = load_scenes(TESTSET)[0][: options.scenes]
-    figures: dict[str, Any] = {"scenes": len(scenes), "num_samples": options.num_samples, "lists": {}}
+    metrics: dict[str, Any] = {"scenes": len(scenes), "num_samples": options.num_samples, "lists": {}}
     for name, counts in block_lists(scenes, options.block_list_weights).items():
         questions = list(zip((scene.silhouette for scene in scenes), counts, strict=True))
         clock, processor = searched(questions, options.num_samples, options.processes)
         blocks = int(counts.sum()) * options.num_samples
-        figures["lists"][name] = {"blocks": blocks, "seconds": clock, "processor_seconds": processor}
-    figures["processes"] = options.processes
+        metrics["lists"][name] = {"blocks": blocks, "seconds": clock, "processor_seconds": processor}
+    metrics["processes"] = options.processes
     if options.naive:
-        figures["naive"] = naive(scenes[: options.naive])
-    report("brute_force", figures, [table(figures)], options.out)
+        metrics["naive"] = naive(scenes[: options.naive])
+    report("brute_force", metrics, [table(metrics)], options.out)
 
 
 def block_lists(scenes: Sequence[Scene], weights: str) -> dict[str, NDArray[np.int64]]:
@@ -103,19 +103,19 @@ def _processor(work: Callable[[], object]) -> float:
     return time.process_time() - began
 
 
-def table(figures: dict[str, Any]) -> Any:
+def table(metrics: dict[str, Any]) -> Any:
     """What is printed."""
     rows = [
         [f"{name} lists", str(f["blocks"]), f"{f['seconds']:.1f}", f"{f['processor_seconds']:.1f}"]
-        for name, f in figures["lists"].items()
+        for name, f in metrics["lists"].items()
     ]
-    if "naive" in figures:
-        loop, blocks = figures["naive"], sum(f["blocks"] for f in figures["lists"].values())
+    if "naive" in metrics:
+        loop, blocks = metrics["naive"], sum(f["blocks"] for f in metrics["lists"].values())
         once = loop["processor_seconds"] / loop["blocks"]
         rows.append(["naive loop", str(loop["blocks"]), "", f"{loop['processor_seconds']:.1f}"])
         rows.append(["naive loop, both lists (extrapolated)", str(blocks), "", f"{once * blocks:.0f}"])
     title = (
-        f"Brute force, {figures['scenes']} scenes x {figures['num_samples']} samples, {figures['processes']} processes"
+        f"Brute force, {metrics['scenes']} scenes x {metrics['num_samples']} samples, {metrics['processes']} processes"
     )
     return plain_table(title, ("", "blocks", "clock [s]", "processor [s]"), rows)
 

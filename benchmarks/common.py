@@ -47,10 +47,10 @@ class Child:
 def run_child(arguments: Sequence[str], threads: int | None = None) -> Child:
     """Run a command to its end, in the repository root.
 
-    On Linux a process inherits the peak of whoever started it: measure children before importing much.
+    On Linux a process inherits the peak of the process that started it: measure children before importing much.
 
     Args:
-        arguments: Of the command.
+        arguments: Words of the command.
         threads: For OpenMP; by default what the environment says.
 
     Raises:
@@ -91,7 +91,7 @@ def summary(values: Sequence[float]) -> dict[str, float]:
 
 
 def machine() -> dict[str, Any]:
-    """What the figures depend on: processor, load, versions, commit."""
+    """What the metrics depend on: processor, load, versions, commit."""
     return {
         "cpu": _cpu_model(),
         "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
@@ -141,11 +141,11 @@ def argument_parser(module: str, description: str | None) -> argparse.ArgumentPa
         description=(description or "").partition("\n\n")[0],
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    parser.add_argument("--out", type=Path, metavar="FILE.json", help="write the figures there too")
+    parser.add_argument("--out", type=Path, metavar="FILE.json", help="file for the metrics too")
     return parser
 
 
-def report(name: str, figures: Mapping[str, Any], tables: Sequence[Table], out: Path | None) -> None:
+def report(name: str, metrics: Mapping[str, Any], tables: Sequence[Table], out: Path | None) -> None:
     """Print tables and machine; write everything as JSON if there is where to."""
     facts = machine()
     console = Console()
@@ -165,7 +165,7 @@ def report(name: str, figures: Mapping[str, Any], tables: Sequence[Table], out: 
         "benchmark": name,
         "command": " ".join([f"python -m benchmarks.{name}", *sys.argv[1:]]),
         "machine": facts,
-        "figures": figures,
+        "figures": metrics,  # the key of the files in docs/results
     }
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, content)
@@ -173,7 +173,7 @@ def report(name: str, figures: Mapping[str, Any], tables: Sequence[Table], out: 
 
 
 def plain_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-    """A table whose first column is text and whose others are figures."""
+    """Make a table whose first column is text and whose others are numbers."""
     table = Table(title=escape(title))
     for number, heading in enumerate(headings):
         table.add_column(escape(heading), justify="right" if number else "left")

@@ -38,7 +38,7 @@ from stackgen.stack import Stack
 from stackgen.world import PAPER_GRID, PAPER_WORLD
 
 SAMPLES = 3
-"""Of the protocol."""
+"""Samples of a scene in the protocol."""
 
 Counts = NDArray[np.int64]
 
@@ -65,7 +65,7 @@ def main() -> None:
     predictor = load_predictor(options.block_list_weights)
     predicted = predictor.predict(np.stack([scene.silhouette for scene in scenes]), top=1)[:, 0]
     lists = {TRUE_LIST: [scene.counts for scene in scenes], PREDICTED_LIST: list(predicted)}
-    figures: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "test_set": dataset.manifest.sha256,
         "physics": StaticsFirst().physics.to_json(),
         "samples": SAMPLES,
@@ -76,8 +76,8 @@ def main() -> None:
     for source, counts in lists.items():
         began = time.perf_counter()
         found = list(search(scenes, counts, options.placements, options.workers, source))
-        figures["lists"][source] = {**summary(scenes, counts, found), "seconds": time.perf_counter() - began}
-    report("diversity_limit", figures, tables(figures), options.out)
+        metrics["lists"][source] = {**summary(scenes, counts, found), "seconds": time.perf_counter() - began}
+    report("diversity_limit", metrics, tables(metrics), options.out)
 
 
 class StaticsFirst(StabilityChecker):
@@ -149,14 +149,14 @@ def summary(scenes: Sequence[Scene], counts: Sequence[Counts], found: Sequence[A
     }
 
 
-def tables(figures: dict[str, Any]) -> list[Any]:
+def tables(metrics: dict[str, Any]) -> list[Any]:
     """What is printed."""
-    parts = figures["lists"]
+    parts = metrics["lists"]
     names = [name for name, value in parts[TRUE_LIST].items() if isinstance(value, dict)]
     rows = [[name.replace("_", " "), *(_text(part[name]) for part in parts.values())] for name in names]
     rows.append(["scenes", *(str(len(part["scenes"])) for part in parts.values())])
     rows.append(["seconds", *(f"{part['seconds']:.0f}" for part in parts.values())])
-    return [plain_table(f"Valid layouts, {SAMPLES} samples a scene, mean and 95 % interval", ("figure", *parts), rows)]
+    return [plain_table(f"Valid layouts, {SAMPLES} samples a scene, mean and 95 % interval", ("metric", *parts), rows)]
 
 
 def _text(value: dict[str, float] | None) -> str:

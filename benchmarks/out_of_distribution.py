@@ -46,12 +46,12 @@ def parser() -> argparse.ArgumentParser:
     options = argument_parser(__name__, __doc__)
     names = ["brute-force", "greedy-random", "default"]
     options.add_argument("--weights", nargs="+", default=names, help="methods: names, files of weights or run folders")
-    options.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS), help="of silhouettes")
+    options.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS), help="kinds of silhouettes")
     options.add_argument("--scenes", type=int, default=50, help="how many, evenly spread over the test set")
-    options.add_argument("--num_samples", type=int, default=3, help="of each scene")
+    options.add_argument("--num_samples", type=int, default=3, help="samples of each scene")
     options.add_argument("--verified", action="store_true", help="add verified sampling with the last of the weights")
-    options.add_argument("--draws", type=int, default=64, help="of a scene, at most, for verified sampling")
-    options.add_argument("--seed", type=int, default=0, help="of disturbances and noise")
+    options.add_argument("--draws", type=int, default=64, help="stacks that verified sampling may draw for a scene")
+    options.add_argument("--seed", type=int, default=0, help="seed of disturbances and noise")
     return options
 
 
@@ -119,7 +119,7 @@ def scaling(percent: float) -> NDArray[np.float64]:
 
 
 def rough(mask: Mask, rng: np.random.Generator) -> Mask:
-    """Of the pixels on either side of an edge 30 % change; specks go."""
+    """Change 30 % of the pixels on either side of an edge; remove specks."""
     edge = ndimage.binary_dilation(mask) & ~ndimage.binary_erosion(mask)
     noisy = mask ^ (edge & (rng.random(mask.shape) < 0.3))
     labels, _ = ndimage.label(noisy)
@@ -242,7 +242,7 @@ def main() -> None:
     checker, predictor = SimulatorChecker(until_fall=True), AlignedPredictor(load_predictor("default"))
     methods = methods_of(options, checker)
     rows: list[dict[str, Any]] = []
-    figures = {
+    metrics = {
         "test_set": dataset.manifest.sha256,
         "samples_per_scene": options.num_samples,
         "seed": options.seed,
@@ -262,8 +262,8 @@ def main() -> None:
             print(f"{kind}, {name}: " + ", ".join(f"{m} {_percent(rows[-1][m])}" for m in METRICS), flush=True)
             if options.out is not None:
                 options.out.parent.mkdir(parents=True, exist_ok=True)
-                write_json(options.out, figures)
-    report("out_of_distribution", figures, [table(rows, metric) for metric in METRICS[:2]], options.out)
+                write_json(options.out, metrics)
+    report("out_of_distribution", metrics, [table(rows, metric) for metric in METRICS[:2]], options.out)
 
 
 def table(rows: Sequence[Mapping[str, Any]], metric: str) -> Any:

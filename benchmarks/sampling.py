@@ -52,17 +52,19 @@ class Row:
 def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
-    options.add_argument("--weights", default="default", help="of a diffusion model")
+    options.add_argument("--weights", default="default", help="weights of a diffusion model")
     options.add_argument("--data", default="data/base.npz", help="dataset with a validation split")
     options.add_argument("--scenes", type=int, default=150, help="drawn from the validation split")
-    options.add_argument("--num_samples", type=int, default=3, help="of each scene")
-    options.add_argument("--seed", type=int, default=0, help="of scenes and noise")
+    options.add_argument("--num_samples", type=int, default=3, help="samples of each scene")
+    options.add_argument("--seed", type=int, default=0, help="seed of scenes and noise")
     options.add_argument("--tables", nargs="+", choices=TABLES, default=["steps", "verified"], help="what to measure")
-    options.add_argument("--kinds", nargs="+", choices=list(KINDS), default=["ddpm", "ddim", "dpm"], help="of samplers")
+    options.add_argument(
+        "--kinds", nargs="+", choices=list(KINDS), default=["ddpm", "ddim", "dpm"], help="kinds of samplers"
+    )
     options.add_argument("--steps", nargs="+", type=int, default=[50, 25, 16, 10, 8, 5, 4], help="calls of the network")
-    options.add_argument("--spacing", type=float, default=None, help="of the steps, see SamplerConfig")
+    options.add_argument("--spacing", type=float, default=None, help="spacing of the steps, see SamplerConfig")
     options.add_argument("--checker", choices=get_args(CheckerName), default="simulator", help="which stacks stand")
-    options.add_argument("--draws", type=int, default=64, help="of a scene, at most, for verified sampling")
+    options.add_argument("--draws", type=int, default=64, help="stacks that verified sampling may draw for a scene")
     options.add_argument("--runs", type=int, default=10, help="timed calls a row")
     return options
 
@@ -98,7 +100,7 @@ def main() -> None:
     chosen = np.random.default_rng(options.seed).choice(len(scenes), min(options.scenes, len(scenes)), replace=False)
     scenes = [scenes[i] for i in sorted(chosen)]
     checker = SimulatorChecker(until_fall=True)
-    figures: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "weights": loaded.card.get("name", options.weights),
         "weights_sha256": loaded.card.get("sha256"),
         "dataset": dataset.manifest.name,
@@ -111,13 +113,13 @@ def main() -> None:
     }
     for number, row in enumerate(rows, 1):
         found = measure(row, loaded.configured(row.sampler), scenes, checker, options)
-        figures["rows"].append(found)
+        metrics["rows"].append(found)
         line = ", ".join(f"{name} {percent(found[name])}" for name in METRICS)
         print(f"{number}/{len(rows)} {row.table}: {row.name}: {line}, {found['milliseconds']:.0f} ms", flush=True)
         if options.out is not None:
             options.out.parent.mkdir(parents=True, exist_ok=True)
-            write_json(options.out, figures)
-    report("sampling", figures, tables(figures["rows"], len(scenes), options.num_samples), options.out)
+            write_json(options.out, metrics)
+    report("sampling", metrics, tables(metrics["rows"], len(scenes), options.num_samples), options.out)
 
 
 def measure(row: Row, sampler: Any, scenes: Sequence[Any], checker: Any, options: argparse.Namespace) -> dict[str, Any]:

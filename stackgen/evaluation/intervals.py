@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 RESAMPLES = 2000
-"""Of the bootstrap."""
+"""Draws of the bootstrap."""
 
 
 @dataclass(frozen=True)
@@ -26,15 +26,15 @@ class Estimate:
 
 
 def clustered_ratio(sums: ArrayLike, weights: ArrayLike, seed: int = 0) -> Estimate | None:
-    """The sum of the sums over the sum of the weights, with a cluster bootstrap over scenes.
+    """Divide the sum of the sums by the sum of the weights, with a cluster bootstrap over scenes.
 
     Whole scenes are drawn with replacement, as many as there are, 2000 times; the interval is from
     the 2.5th to the 97.5th percentile of the ratio. Unlike a normal interval it never leaves the
     values that the metric can take. The seed is fixed: equal scores, equal interval.
 
     Args:
-        sums, weights: (m,) of each scene.
-        seed: Of the resampling.
+        sums, weights: (m,) sum and weight of each scene.
+        seed: Seed of the resampling.
 
     Returns:
         None where the weights are all 0: the metric does not exist.
@@ -57,5 +57,5 @@ def clustered_ratio(sums: ArrayLike, weights: ArrayLike, seed: int = 0) -> Estim
 
 @lru_cache(maxsize=8)
 def _draws(m: int, seed: int) -> NDArray[np.float64]:
-    """(RESAMPLES, m) how often each of m scenes is drawn: the slow part, and a report asks hundreds of times."""
+    """Draw (RESAMPLES, m) how often each of m scenes is taken: the slow part, and a report asks hundreds of times."""
     return np.random.default_rng(seed).multinomial(m, np.full(m, 1 / m), size=RESAMPLES).astype(float)

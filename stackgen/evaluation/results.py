@@ -155,13 +155,14 @@ def write_evaluation(path: Path, evaluation: Evaluation, question: Question) -> 
         StackgenError: If it cannot be written.
     """
     named = {name: getattr(evaluation, name) for name in _KEPT}
-    catalogue = next((s.catalogue for scene in evaluation.scenes for s in scene.stacks), None)
-    world = None if catalogue is None else catalogue.to_json()
+    catalogue = next(stack.catalogue for scene in evaluation.scenes for stack in scene.stacks).to_json()
     results = [_scene_to_json(scene) for scene in evaluation.scenes]
-    row = {**evaluation.summary(), "question": question, "kept": named, "catalogue": world, "results": results}
+    row = {**evaluation.summary(), "question": question, "kept": named, "catalogue": catalogue, "results": results}
     write_json(path, {"format": FORMAT, "rows": [row]}, indent=None)
 
 
+_OF_SAMPLE = ("stable", "ious", "front_iou_before", "layout")
+_OF_SCENE = ("name", "counts", "fell", "drop", "list_rank", "feasible", "seconds")
 _KEPT = ("method", "block_list", "num_samples", "seed", "physics", "facts", "checking_seconds")
 
 
@@ -178,7 +179,7 @@ def read_evaluation(path: Path) -> tuple[Evaluation, Question]:
         if data["format"] != FORMAT:
             raise ValueError(data["format"])
         (row,) = data["rows"]
-        catalogue = None if row["catalogue"] is None else Catalogue.from_json(row["catalogue"])
+        catalogue = Catalogue.from_json(row["catalogue"])
         scenes = tuple(_scene_from_json(scene, catalogue) for scene in row["results"])
         if not scenes or not isinstance(row["question"], dict):
             raise ValueError("empty")
@@ -190,43 +191,25 @@ def read_evaluation(path: Path) -> tuple[Evaluation, Question]:
 
 
 def _scene_to_json(scene: SceneResult) -> dict[str, Any]:
-    samples = scene.score.samples
     return {
-        "name": scene.name,
-        "counts": scene.counts,
-        "stable": [sample.stable for sample in samples],
-        "ious": [dict(sample.ious) for sample in samples],
-        "front_iou_before": [sample.front_iou_before for sample in samples],
-        "layouts": [sample.layout for sample in samples],
-        "fell": scene.fell,
-        "drop": scene.drop,
-        "list_rank": scene.list_rank,
-        "feasible": scene.feasible,
-        "seconds": scene.seconds,
+        **{name: getattr(scene, name) for name in _OF_SCENE},
+        "samples": [{name: getattr(sample, name) for name in _OF_SAMPLE} for sample in scene.score.samples],
         "shapes": [stack.shapes.tolist() for stack in scene.stacks],
         "poses": [stack.poses.tolist() for stack in scene.stacks],
     }
 
 
-def _scene_from_json(data: Mapping[str, Any], catalogue: Catalogue | None) -> SceneResult:
-    layouts = [tuple(tuple(row) for row in layout) for layout in data["layouts"]]
-    columns = zip(data["stable"], data["ious"], data["front_iou_before"], layouts, strict=True)
-    stacks = []
-    for shapes, poses in zip(data["shapes"], data["poses"], strict=True):
-        if catalogue is None:
-            raise ValueError("no catalogue")
-        stacks.append(Stack(np.array(shapes, dtype=np.int64), np.array(poses), catalogue))
-    return SceneResult(
-        str(data["name"]),
-        tuple(data["counts"]),
-        SceneScore(tuple(SampleScore(*column) for column in columns)),
-        tuple(tuple(blocks) for blocks in data["fell"]),
-        tuple(data["drop"]),
-        data["list_rank"],
-        data["feasible"],
-        data["seconds"],
-        tuple(stacks),
-    )
+def _scene_from_json(data: Mapping[str, Any], catalogue: Catalogue) -> SceneResult:
+    samples = [{name: _tuples(sample[name]) for name in _OF_SAMPLE} for sample in data["samples"]]
+    stacks = (Stack(np.array(shapes, dtype=np.int64), np.array(poses), catalogue)
+              for shapes, poses in zip(data["shapes"], data["poses"], strict=True))  # fmt: skip
+    score = SceneScore(tuple(SampleScore(**sample) for sample in samples))
+    return SceneResult(score=score, stacks=tuple(stacks), **{name: _tuples(data[name]) for name in _OF_SCENE})
+
+
+def _tuples(value: Any) -> Any:
+    """Turn lists, and lists in lists, into tuples, as they were written."""
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def write_scenes(path: str | Path, evaluation: Evaluation) -> None:

@@ -133,7 +133,7 @@ def test_same_seed_same_questions_and_each_batch_its_own(scenes: list[Scene]) ->
     assert first.seeds == again.seeds and len(set(first.seeds) | set(other.seeds)) == 6
 
 
-def test_predicted_lists_are_asked_for_and_judged_themselves(scenes: list[Scene]) -> None:
+def test_predicted_lists_are_asked_for_and_measured_themselves(scenes: list[Scene]) -> None:
     result = asked(scenes, predictor=Lists(scenes))
     assert result.block_list == "predicted"
     lists = {name: e.value for name, e in result.list_estimates().items() if e}
