@@ -146,7 +146,7 @@ def build(
         on_block: Called with the number of blocks that are placed.
         camera: Camera that films it.
     """
-    outcome = _simulate(planned, grasp, noise, window, on_block, camera)
+    outcome = _simulate(planned, grasp=grasp, noise=noise, window=window, on_block=on_block, camera=camera)
     order, physics, built = planned.design.order, planned.physics, outcome.stack
     moved = np.linalg.norm(built.poses[:, :3] - planned.plan.stack.poses[:, :3], axis=1)
     verdict, generated = _verdict(built, physics), planned.design.generated  # awake, in a fresh world
@@ -184,6 +184,7 @@ class _Outcome:
 
 def _simulate(
     planned: PlannedBuild,
+    *,
     grasp: Grasp,
     noise: PickNoise,
     window: bool,

@@ -23,7 +23,7 @@ RATE = 120.0
 """Samples of a motion in a second: about the UR5's own control rate."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Motion:
     """The joint angles over time.
 
@@ -98,10 +98,17 @@ def joint_motion(name: str, start: Floats, goal: Floats, speeds: Speeds) -> Moti
     furthest = float(np.abs(goal - start).max())
     times, fraction, rate = _profile(1.0, *(limits / furthest))
     positions = start + fraction[:, None] * (goal - start)
-    return Motion(name, "joint", times, positions, rate[:, None] * (goal - start), float(limits[0]))
+    return Motion(
+        name=name,
+        kind="joint",
+        times=times,
+        positions=positions,
+        velocities=rate[:, None] * (goal - start),
+        speed=float(limits[0]),
+    )
 
 
-def line_motion(name: str, joints: Floats, distances: Floats, speed: float, speeds: Speeds) -> Motion:
+def line_motion(name: str, joints: Floats, distances: Floats, *, speed: float, speeds: Speeds) -> Motion:
     """Move along joint angles (m, n) that were solved at distances (m,) on a straight line [m].
 
     The tool keeps to its limits, and slows down where a joint would have to turn faster than it may.
@@ -117,7 +124,8 @@ def line_motion(name: str, joints: Floats, distances: Floats, speed: float, spee
     times, along, rate = _profile(
         float(distances[-1]), top, float(min(speeds.line_acceleration, hardest)), speeds.line_jerk
     )
-    return Motion(name, "line", times, path(along), path(along, 1) * rate[:, None], top)
+    velocities = path(along, 1) * rate[:, None]
+    return Motion(name=name, kind="line", times=times, positions=path(along), velocities=velocities, speed=top)
 
 
 def _profile(length: float, speed: float, acceleration: float, jerk: float) -> tuple[Floats, Floats, Floats]:

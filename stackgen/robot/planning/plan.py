@@ -33,7 +33,7 @@ class Collision(StackgenError):
     """A motion comes too near to something."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class BlockPlan:
     """What the arm does with one block.
 
@@ -188,7 +188,16 @@ class _Planner:
         self._release(block, goal)
         self._line("retreat", slow, speed=2 * self.workcell.speeds.touch)
         self._line("retreat", self._raised(place, self._safe_height(place)))
-        return BlockPlan(block, waiting, goal, touching, tuple(self.actions), self.clearance, self.distance, self.turn)
+        return BlockPlan(
+            block=block,
+            waiting=waiting,
+            goal=goal,
+            touching=touching,
+            actions=tuple(self.actions),
+            clearance=self.clearance,
+            distance=self.distance,
+            turn=self.turn,
+        )
 
     def _straighten(self, waiting: Waiting) -> None:
         """Push the block from both ends to the middle of its slot, with closed jaws."""
@@ -250,7 +259,7 @@ class _Planner:
             tip[:3, 3] = start[:3, 3] + (goal[:3, 3] - start[:3, 3]) * distance / length
             joints.append(self._solve(tip, joints[-1]))
         speeds = self.workcell.speeds
-        self._append(line_motion(name, np.array(joints), distances, speed or speeds.line, speeds))
+        self._append(line_motion(name, np.array(joints), distances, speed=speed or speeds.line, speeds=speeds))
 
     def _solve(self, tip: Floats, near: Floats) -> Floats:
         low, high = (np.array(corner) for corner in (self.workcell.workspace.low, self.workcell.workspace.high))

@@ -26,7 +26,7 @@ TIP_UP = np.diag([-1.0, 1.0, -1.0, 1.0])
 _SWEEP = 0.005  # height of the finger tips over the table while they push a block [m]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Waiting:
     """A block in its slot.
 
@@ -58,12 +58,14 @@ def lay_out(stack: Stack, order: tuple[int, ...], workcell: Workcell, cell_size:
             f"the staging area is too small: {len(order)} blocks, but {len(slots)} slots; add to cell.staging.slots"
         )
     return {
-        block: wait(stack, block, slot, workcell, cell_size)
+        block: wait(stack, block, slot=slot, workcell=workcell, cell_size=cell_size)
         for block, slot in zip(order, slots[: len(order)], strict=True)
     }
 
 
-def wait(stack: Stack, block: int, slot: tuple[float, float, float], workcell: Workcell, cell_size: float) -> Waiting:
+def wait(
+    stack: Stack, block: int, *, slot: tuple[float, float, float], workcell: Workcell, cell_size: float
+) -> Waiting:
     """Lay a block into a slot, on the face that is to be its lowest."""
     shape = stack.catalogue[int(stack.shapes[block])]
     jaws, staging = workcell.jaws, workcell.staging
@@ -98,11 +100,11 @@ def wait(stack: Stack, block: int, slot: tuple[float, float, float], workcell: W
     tip[0] = (in_slot[:3, :3] @ (shape.center_of_mass * cell_size))[0] + in_slot[0, 3]
     sweep = max(_SWEEP, height + _SWEEP - jaws.pad_length)
     return Waiting(
-        slot_frame @ in_slot,
-        slot_frame @ pose(tip) @ TIP_UP,
-        _ends((corners + in_slot[:3, 3])[:, [0, 2]], sweep),
-        slot_frame @ pose((0.0, 0.0, sweep)) @ TIP_UP,
-        height,
+        frame=slot_frame @ in_slot,
+        grasp=slot_frame @ pose(tip) @ TIP_UP,
+        ends=_ends((corners + in_slot[:3, 3])[:, [0, 2]], sweep),
+        sweep=slot_frame @ pose((0.0, 0.0, sweep)) @ TIP_UP,
+        top=height,
     )
 
 

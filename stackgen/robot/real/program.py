@@ -55,7 +55,7 @@ class Controller:
                 raise StackgenError(f"controller: {name} must be positive, got {getattr(self, name):g}")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Move:
     """One motion as a controller is asked for it.
 
@@ -113,12 +113,12 @@ def controller_move(motion: Motion, workcell: Workcell) -> Move:
         )
     end = motion.end
     return Move(
-        motion.name,
-        motion.kind,
-        controller_pose(end, workcell),
-        end,
-        float(np.clip(speed, _SLOWEST, limits[0])),
-        float(np.clip(acceleration, _SLOWEST, limits[1])),
+        name=motion.name,
+        kind=motion.kind,
+        pose=controller_pose(end, workcell),
+        joints=end,
+        speed=float(np.clip(speed, _SLOWEST, limits[0])),
+        acceleration=float(np.clip(acceleration, _SLOWEST, limits[1])),
     )
 
 

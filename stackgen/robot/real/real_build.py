@@ -24,7 +24,7 @@ PROGRAM = "build.script"
 MESSAGES = "ur-rtde.log"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RealBuild:
     """What is to be built with a real arm.
 
@@ -88,7 +88,14 @@ def prepare(
         progress = replace(progress, placed=found.placed)
     program = urscript(plan, workcell, controller, gripper)
     write_atomically(folder / PROGRAM, program.encode())
-    return RealBuild(plan, workcell, controller, gripper, folder, progress)
+    return RealBuild(
+        plan=plan,
+        workcell=workcell,
+        controller=controller,
+        gripper=gripper,
+        folder=folder,
+        progress=progress,
+    )
 
 
 def show(build: RealBuild) -> None:

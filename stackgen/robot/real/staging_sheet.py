@@ -21,7 +21,6 @@ from stackgen.io.files import write_atomically
 from stackgen.robot.planning.staging import Waiting, lay_out
 from stackgen.robot.workcell import Workcell, pose
 from stackgen.stack import Stack
-from stackgen.world import Shape
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +36,7 @@ _SKETCH = 0.3  # scale of the front view beside an outline
 SUFFIXES = (".pdf", ".svg")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SlotDrawing:
     """A block in its slot, on paper.
 
@@ -66,23 +65,29 @@ def places(stack: Stack, order: tuple[int, ...], workcell: Workcell, cell_size: 
     """
     waiting = lay_out(stack, order, workcell, cell_size)
     return [
-        _place(number, block, waiting[block], stack.catalogue[int(stack.shapes[block])], workcell, cell_size)
+        _drawing(number, waiting[block], block, stack, workcell=workcell, cell_size=cell_size)
         for number, block in enumerate(order, 1)
     ]
 
 
-def _place(
-    number: int, block: int, waiting: Waiting, shape: Shape, workcell: Workcell, cell_size: float
+def _drawing(
+    number: int, waiting: Waiting, block: int, stack: Stack, *, workcell: Workcell, cell_size: float
 ) -> SlotDrawing:
+    shape = stack.catalogue[int(stack.shapes[block])]
     corners = shape.vertices * cell_size @ waiting.frame[:3, :3].T + waiting.frame[:3, 3]
     x, y, turn = workcell.staging.slots[number - 1]
     slot = pose((x, y, 0.0), turn)
     half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [workcell.staging.length / 2, workcell.staging.depth / 2]
-    border = half @ slot[:2, :2].T + [x, y]
-    in_slot = (corners - slot[:3, 3]) @ slot[:3, :3]
-    front = _hull(in_slot[:, [0, 2]])
+    front = _hull(((corners - slot[:3, 3]) @ slot[:3, :3])[:, [0, 2]])
     middle = (front.min(axis=0) + front.max(axis=0)) / 2
-    return SlotDrawing(number, block, shape.name, border * 1e3, _hull(corners[:, :2]) * 1e3, (front - middle) * 1e3)
+    return SlotDrawing(
+        slot=number,
+        block=block,
+        shape=shape.name,
+        border=(half @ slot[:2, :2].T + [x, y]) * 1e3,
+        outline=_hull(corners[:, :2]) * 1e3,
+        front=(front - middle) * 1e3,
+    )
 
 
 def write_staging_sheet(

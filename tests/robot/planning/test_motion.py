@@ -56,7 +56,7 @@ def test_a_line_is_straight_in_space_and_as_slow_as_asked_for() -> None:
     joints = [HOME]
     for height in heights:
         joints.append(kinematics.solve(WORKCELL.flange_in_base(pose((0.1, 0.0, height)) @ TIP_UP), joints[-1]).joints)
-    found = line_motion("lower", np.array(joints[1:]), heights[0] - heights, 0.1, SPEEDS)
+    found = line_motion("lower", np.array(joints[1:]), heights[0] - heights, speed=0.1, speeds=SPEEDS)
     tips = np.array([WORKCELL.tip_in_table(ARM.forward(q))[:3, 3] for q in found.positions])
     assert np.abs(tips[:, :2] - [0.1, 0.0]).max() < 2e-4
     speeds = np.linalg.norm(np.diff(tips, axis=0), axis=1) / np.diff(found.times)
