@@ -18,7 +18,7 @@ import numpy as np
 from rich.progress import track
 
 from benchmarks.common import argument_parser, peak_rss_mb, plain_table, report, start
-from stackgen.data.generation.deconstruction import Judge, Settled, deconstruct, surely_falls
+from stackgen.data.generation.deconstruction import Settled, Settler, deconstruct, surely_falls
 from stackgen.data.generation.designs import draw_design, realize
 from stackgen.data.generation.generate import GenerateSettings, template_samples
 from stackgen.data.shards import Sample, encode_shard
@@ -52,13 +52,13 @@ class Counting(Simulator):
 
 
 @dataclass(frozen=True)
-class Recording(Judge):
-    """A judge that writes down what statics said of each rest."""
+class Recording(Settler):
+    """A settler that writes down what statics said of each rest."""
 
     said: list[tuple[Stack, Outcome]] = field(default_factory=list)
 
     def settle_rest(self, rest: Settled) -> Settled | None:
-        """As every judge does."""
+        """As every settler does."""
         self.said.append((rest.stack, rest.outcome))
         return super().settle_rest(rest)
 
@@ -133,9 +133,9 @@ def decisions(settings: GenerateSettings, numbers: Sequence[int]) -> dict[str, A
         for number in track(numbers, "asking the simulator, too", transient=True):
             rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
             design = realize(draw_design(rng, PAPER_WORLD, settings.template), rng, PAPER_WORLD, settings.template)
-            judge = Recording(simulator, settings.accept, settings.settle_twice, settings.certificate)
-            list(deconstruct(design, judge, settings.max_removals))
-            for stack, word in judge.said:
+            settler = Recording(simulator, settings.accept, settings.settle_twice, settings.certificate)
+            list(deconstruct(design, settler, settings.max_removals))
+            for stack, word in settler.said:
                 if surely_falls(stack):
                     continue
                 counts[word]["number"] += 1

@@ -1,4 +1,4 @@
-"""stackgen dataset: is it whole, make it whole, what is in it, split it anew, one file of it."""
+"""stackgen dataset: verify, repair, describe, split and export a dataset."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ TRAVELS = 64 * 2**20
 
 
 def verify(folder: Path) -> int:
-    """Compare every shard with its checksum and read every stack; exit code 1 if anything is wrong.
+    """Compare every shard with its checksum and read every stack; the exit code is 1 if anything is wrong.
 
     Args:
-        folder: Of the dataset.
+        folder: Folder of the dataset.
     """
     from stackgen.data.inspection.verify import verify as find_problems
 
@@ -52,14 +52,14 @@ def verify(folder: Path) -> int:
 def repair(
     folder: Path, workers: int | None = None, executor: ExecutorName = "local", other_bytes: bool = False
 ) -> None:
-    """Make the shards again that are missing or damaged, byte for byte; all others are left alone.
+    """Make missing and damaged shards again, byte for byte; all others are left alone.
 
     Args:
-        folder: Of the dataset.
-        workers: Processes; by default one for each core.
-        executor: Processes of this machine, or tasks of a Ray cluster.
-        other_bytes: Accept shards that are not what was written, where this version of the simulator makes
-            others; dataset.json then gets their checksums.
+        folder: Folder of the dataset.
+        workers: Number of processes; by default one for each core.
+        executor: Place where shards are made: `local`, processes of this machine; `ray`, tasks of a Ray cluster.
+        other_bytes: Whether to accept other shards where this version of the simulator cannot make the same;
+            dataset.json then gets their checksums.
     """
     from stackgen.data.generation.executors import make_executor
     from stackgen.data.generation.repair import repair as make_again
@@ -69,7 +69,7 @@ def repair(
     for name in done.identical:
         print(f"made {folder / name} again, byte for byte")
     for name in done.other:
-        print(f"made {folder / name} anew, with other bytes: dataset.json and the dataset's hash have changed")
+        print(f"made {folder / name} again, with other bytes: dataset.json and the dataset's hash have changed")
     if not done.identical and not done.other:
         print(f"{folder}: every shard is as it was written; nothing to repair")
 
@@ -78,12 +78,12 @@ def info(folder: Path, out: Path | None = None, margins: int = 500, samples: int
     """Count, measure and draw what is in a dataset, and how near the frozen test scenes are to it.
 
     Args:
-        folder: Of the dataset, or its compact .npz.
+        folder: Folder of the dataset, or its compact .npz file.
         out: Folder for info.json, info.png and samples.png; by default the dataset's own, whose card then
-            gets the figures, too. Beside a compact file nothing is written without it.
-        margins: Stacks whose margin statics is asked for; 0 for none.
-        samples: Random stacks on the contact sheet; 0 for none.
-        seed: Of both draws.
+            gets the numbers too. For a compact file nothing is written without this option.
+        margins: Number of stacks whose stability margin statics computes; 0 for none.
+        samples: Number of random stacks on the contact sheet; 0 for none.
+        seed: Seed of both draws.
     """
     from stackgen.data.inspection.contents import Contents, describe_margins, facts, sample_margins
     from stackgen.data.inspection.plots import draw_facts, draw_samples, paragraphs
@@ -121,15 +121,15 @@ def split(
     seed: int = 0,
     out: Path | None = None,
 ) -> None:
-    """Say how a dataset is split, or write it anew with other shares: what belongs together stays on one side.
+    """Print how a dataset is split, or write a new dataset with other shares.
 
     Args:
-        folder: Of the dataset.
+        folder: Folder of the dataset.
         validation: Share of the validation split in the new dataset; 0 if only the other share is given.
         test: Share of the test split in the new dataset; 0 if only the other share is given.
-        by: What stays together: `template`, all stacks deconstructed from one template; `layout`, those of all
-            templates that are the same design or its mirror image.
-        seed: Another one, another choice.
+        by: Stacks that stay in one split: `template`, all that were deconstructed from one template; `layout`, those
+            of all templates that are the same design or its mirror image.
+        seed: Seed of the choice.
         out: Folder of the new dataset; without it the present split is printed.
     """
     manifest = Dataset.open(folder).manifest
@@ -156,8 +156,8 @@ def export(folder: Path, out: Path) -> None:
     """Write a whole dataset as one compact file of arrays, for a machine that only trains.
 
     Args:
-        folder: Of the dataset.
-        out: File to write, ending in .npz; `--data.path` takes it.
+        folder: Folder of the dataset.
+        out: File to write, ending in .npz; `--data.path` accepts it.
     """
     from stackgen.data.compact import save_npz
 
@@ -206,13 +206,13 @@ COMMANDS = {
         repair,
         "stackgen dataset repair data/paper\nstackgen dataset repair data/paper --workers 4",
         files=_FOLDER,
-        flags={"other_bytes": "Accept shards that are not what was written; dataset.json gets their checksums."},
+        flags={"other_bytes": "Accept shards with other bytes; dataset.json gets their checksums."},
     ),
     "info": Command(
         "dataset info",
         info,
         "stackgen dataset info data/paper\nstackgen dataset info data/paper.npz --out out/paper --margins 2000",
-        files=Files("folder", "FOLDER", "Folder of the dataset, or its compact .npz."),
+        files=Files("folder", "FOLDER", "Folder of the dataset, or its compact .npz file."),
     ),
     "split": Command(
         "dataset split",
@@ -247,7 +247,7 @@ def run(verb: str, argv: Sequence[str]) -> int | None:
 
 
 def usage() -> str:
-    """The actions, for `stackgen dataset --help`."""
+    """List the actions, for `stackgen dataset --help`."""
     width = max(map(len, COMMANDS))
     rows = [
         f"  {name:<{width}}  {(command.function.__doc__ or '').partition(chr(10))[0]}"
@@ -256,7 +256,7 @@ def usage() -> str:
     head = [
         "usage: stackgen dataset ACTION FOLDER ... | stackgen dataset ACTION --help",
         "",
-        "Look after a dataset.",
+        "Verify, repair, describe, split or export a dataset.",
         "",
     ]
     return "\n".join([*head, *rows, "", epilog("stackgen dataset info data/paper")])

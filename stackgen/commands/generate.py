@@ -1,4 +1,4 @@
-"""stackgen generate: datasets, by deconstruction."""
+"""stackgen generate: datasets by construction and deconstruction."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ def main(
     executor: ExecutorName = "local",
     shard_range: str | None = None,
 ) -> None:
-    """Make a dataset: templates that settle, then blocks taken out of them one by one.
+    """Make a dataset: random designs settle, then blocks are taken out of them one by one.
 
-    A run that was interrupted goes on where it stopped when it is started again; the result depends on the
-    settings alone, not on the number of workers nor on the executor.
+    An interrupted run continues where it stopped when the same command is started again. The result depends on
+    the settings alone, not on the number of workers or the executor.
 
     Args:
-        settings: What to make.
+        settings: Settings of the dataset.
         out: Folder of the dataset.
-        workers: Processes; by default one for each core.
-        executor: Who makes the shards: processes of this machine, or tasks of a Ray cluster.
-        shard_range: A:B, make only the shards A to B - 1, for jobs that share the folder; a run without it
-            then collects them and makes what is still missing.
+        workers: Number of processes; by default one for each core.
+        executor: Place where shards are made: `local`, processes of this machine; `ray`, tasks of a Ray cluster.
+        shard_range: Range A:B of the shards to make, A to B - 1, for jobs that share the folder; a later run
+            without it collects them and makes what is missing.
     """
     shards = None if shard_range is None else _range(shard_range)
     what, total = (f"stacks of {settings.name}", settings.stacks) if shards is None else ("shards", len(shards))
@@ -43,7 +43,7 @@ def main(
             else:
                 manifest = generate(settings, out, None, advance, make_executor(executor, workers), say)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"whole shards are kept in {out}: the same command goes on from there") from None
+        raise KeyboardInterrupt(f"finished shards are kept in {out}; the same command continues from there") from None
     if shards is not None:
         print(f"shards {shards.start} to {shards.stop - 1} of {out} are there: {stacks} stacks")
         return

@@ -46,7 +46,7 @@ class Settled:
 
 
 @dataclass(frozen=True)
-class Judge:
+class Settler:
     """Settles a stack and says whether it may be data.
 
     Args:
@@ -99,7 +99,7 @@ class Judge:
         return Settled(stack, np.arange(len(stack)), statics)
 
 
-def deconstruct(template: Stack, judge: Judge, max_removals: int = 4) -> Iterator[tuple[tuple[int, ...], Stack]]:
+def deconstruct(template: Stack, settler: Settler, max_removals: int = 4) -> Iterator[tuple[tuple[int, ...], Stack]]:
     """The template and what is left of it after every way of taking blocks out, as long as it stands.
 
     Blocks are taken out one at a time, from settled and stable stacks only; what two orders of removal
@@ -108,7 +108,7 @@ def deconstruct(template: Stack, judge: Judge, max_removals: int = 4) -> Iterato
     Yields:
         The numbers of the removed blocks and the settled rest, fewest removals first.
     """
-    settled = judge.settle(template)
+    settled = settler.settle(template)
     if settled is None:
         return
     bottoms = np.round(template.poses[:, 2], 3)
@@ -125,7 +125,7 @@ def deconstruct(template: Stack, judge: Judge, max_removals: int = 4) -> Iterato
                 taken = tuple(sorted((*removed, block)))
                 if taken in below or not top - set(taken):
                     continue
-                below[taken] = judge.settle_rest(settled.less(place))
+                below[taken] = settler.settle_rest(settled.less(place))
         level = {taken: settled for taken, settled in below.items() if settled is not None}
 
 

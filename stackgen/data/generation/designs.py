@@ -1,4 +1,4 @@
-"""Templates: random designs on the grid (paper, "Generating Data")."""
+"""Random designs on the grid (paper, "Generating Data"); the settled one is a dataset's template."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class DesignSettings:
     """How designs are drawn.
 
     Args:
-        minimum_fill: A row is finished once at least this many of its cells are occupied.
-        displacement: Each block's x is shifted uniformly within this [cell].
-        top_row_only: Shapes that may stand in the top row alone (nothing rests on them).
+        minimum_fill: Number of occupied cells from which on a row is finished.
+        displacement: Largest shift of a block along x, drawn uniformly [cell].
+        top_row_only: Shapes that may stand in the top row alone, since nothing rests on them.
     """
 
     minimum_fill: int = 3
@@ -85,7 +85,7 @@ class Design:
 
     @property
     def key(self) -> str:
-        """The layout as text, without the displacement: equal designs have equal keys."""
+        """The design as text, without the displacement: equal designs have equal keys."""
         return "/".join(",".join(f"{shape}@{left}" for shape, left in row) for row in self.rows)
 
     @staticmethod
@@ -95,7 +95,7 @@ class Design:
         return Design(tuple(tuple((int(s), int(x)) for s, x in (b.split("@") for b in row)) for row in rows))
 
     def mirrored(self, world: World) -> Design:
-        """The design reflected left to right."""
+        """Reflect the design left to right."""
         return Design(
             tuple(
                 tuple((s, world.grid.width - left - cells_wide(world.catalogue[s])) for s, left in reversed(row))
@@ -142,7 +142,7 @@ def draw_design(rng: np.random.Generator, world: World, settings: DesignSettings
 
 
 def realize(design: Design, rng: np.random.Generator, world: World, settings: DesignSettings | None = None) -> Stack:
-    """The template's blocks at their SE(3) poses, each displaced along x; neighbours that the
+    """Put a design's blocks at their SE(3) poses, each displaced along x; neighbours that the
     displacement pushed into each other are moved apart, half the overlap each, as contact would."""
     settings, catalogue, grid = settings or DesignSettings(), world.catalogue, world.grid
     shapes, poses = [], []

@@ -1,8 +1,8 @@
-"""The dataset generator: templates in, shards out, on as many processes as there are.
+"""The dataset generator: designs in, shards out, on as many processes as there are.
 
 A shard holds all stacks of a fixed range of templates, and each template has its own random stream,
 so a shard's bytes depend on the settings and its number alone: not on the number of workers, nor on
-whether the run was interrupted. A run that is started again goes on with the shards that are missing.
+whether the run was interrupted. A run that is started again makes the shards that are missing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 from stackgen.data.card import write_card
 from stackgen.data.dataset import TESTSET, Dataset
-from stackgen.data.generation.deconstruction import Judge, deconstruct
+from stackgen.data.generation.deconstruction import Settler, deconstruct
 from stackgen.data.generation.designs import Design, DesignSettings, draw_design, realize
 from stackgen.data.generation.executors import Executor, make_executor
 from stackgen.data.generation.pictures import Pictures
@@ -36,32 +36,34 @@ from stackgen.sim.statics.plane import StaticsMargins
 from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, Grid, World
 
 REVISION = 1
-"""Of the generator: raised when equal settings begin to mean other stacks, so that nobody mixes the two."""
+"""Revision of the generator: raised when equal settings begin to mean other stacks, so that the two are not mixed."""
 _HOPELESS = 2000  # templates without a stack, after which none is expected
 
 
 @dataclass(frozen=True)
 class GenerateSettings:
-    """A dataset, described; `configs/generate/*.yaml` hold these.
+    """The settings of a dataset; `configs/generate/*.yaml` hold these.
+
+    A template is a design that was drawn, displaced and settled; it has a number, and stacks are made from it.
 
     Args:
-        name: Of the dataset, kept in its manifest.
-        stacks: Stop once this many are stored.
-        seed: Same seed, same dataset.
-        templates_per_shard: All stacks of so many templates share a shard and a split.
-        validation: Share of the templates that goes to this split.
-        test: Likewise; what is left is for training.
-        draw: Keep only so many of the stacks, drawn uniformly; 0 keeps all.
-        max_removals: Blocks taken out of a template, at most.
-        max_blocks: Stacks of more blocks are not stored, but still deconstructed.
-        settle_twice: A stack must stand again when simulated from its settled poses, unless statics is certain.
-        exclude_testset: Leave out every template that `testset-v1` uses, and its mirror image.
-        template: How designs are drawn.
-        accept: When a settled stack is good enough.
+        name: Name of the dataset, kept in its manifest.
+        stacks: Number of stacks; the generator stops once they are stored.
+        seed: Seed; the same one gives the same dataset.
+        templates_per_shard: Templates whose stacks share a shard, and so a split.
+        validation: Share of the templates that goes to the validation split.
+        test: Share of the templates that goes to the test split; the rest is for training.
+        draw: Number of stacks that are kept, drawn uniformly from all; 0 keeps all.
+        max_removals: Largest number of blocks taken out of a template.
+        max_blocks: Largest number of blocks of a stored stack; larger stacks are still deconstructed.
+        settle_twice: Whether a settled stack must stand a second time, unless statics is certain that it does.
+        exclude_testset: Whether to leave out the designs that `testset-v1` uses, and their mirror images.
+        template: How designs are drawn and displaced.
+        accept: How far a stack may settle.
         certificate: When statics is certain enough to spare the simulator a stack.
-        physics: Of the simulator.
-        grid: Design grid and silhouette scale.
-        catalogue: The shapes.
+        physics: Physics of the simulator.
+        grid: Design grid and scale of the silhouettes.
+        catalogue: Shapes of the blocks.
     """
 
     name: str
@@ -101,7 +103,7 @@ class GenerateSettings:
             )
 
     def to_json(self) -> dict[str, Any]:
-        """Plain form without what the manifest stores elsewhere."""
+        """Give the plain form without what the manifest stores elsewhere."""
         plain = asdict(replace(self, catalogue=PAPER_CATALOGUE))
         for key in ("name", "seed", "grid", "catalogue", "physics", "max_blocks"):
             plain.pop(key)
@@ -109,7 +111,7 @@ class GenerateSettings:
 
     @staticmethod
     def from_manifest(manifest: Manifest) -> GenerateSettings:
-        """The settings that a dataset was made with.
+        """Give the settings that a dataset was made with.
 
         Raises:
             StackgenError: If its manifest does not hold them, or holds those of another generator.
@@ -130,12 +132,12 @@ class GenerateSettings:
         return World(self.catalogue, self.grid, self.max_blocks)
 
     def split_of(self, shard: int) -> Split:
-        """The split of a shard."""
+        """Choose the split of a shard."""
         return split_of(shard, self.validation, self.test)
 
 
 _BEFORE = {"certificate": {"enabled": False}}
-"""What datasets are made with whose manifest does not say it, since it was not there yet."""
+"""Settings that older manifests do not name, since they did not exist."""
 
 
 def generate(
@@ -150,11 +152,11 @@ def generate(
 
     Args:
         settings: What to make.
-        out: Its folder.
-        workers: Processes; by default one per core. The result does not depend on it.
+        out: Folder of the dataset.
+        workers: Number of processes; by default one per core. The result does not depend on it.
         progress: Called with the number of stacks stored so far.
-        executor: Who makes the shards; by default processes of this machine.
-        say: Told of shards that were damaged in an interruption and are made again.
+        executor: Runs the making of the shards; by default on processes of this machine.
+        say: Called with a line about each shard that was damaged in an interruption and is made again.
 
     Raises:
         StackgenError: If the folder holds something else, a shard was damaged since the dataset was
@@ -187,15 +189,15 @@ def generate_range(
     """Make some shards of a dataset, for jobs that share its folder; :func:`generate` collects them.
 
     Args:
-        settings: Of the whole dataset.
-        out: Its folder.
-        shards: Their numbers.
-        executor: Who makes them; by default processes of this machine.
+        settings: Settings of the whole dataset.
+        out: Folder of the dataset.
+        shards: Numbers of the shards.
+        executor: Runs their making; by default on processes of this machine.
         progress: Called with the number of shards that are there so far.
-        say: Told of shards that were damaged in an interruption and are made again.
+        say: Called with a line about each shard that was damaged in an interruption and is made again.
 
     Returns:
-        How many stacks they hold; 0 if the dataset is complete already.
+        The number of stacks they hold; 0 if the dataset is complete already.
     """
     with disk_may_be_full(out):
         claim(out, _manifest(settings, ()).to_json(), partial(_are, settings))
@@ -253,16 +255,16 @@ def _revived(kind: type[Any], plain: Mapping[str, Any]) -> Any:
 def template_samples(
     settings: GenerateSettings, number: int, excluded: frozenset[str], simulator: Simulator
 ) -> list[Sample]:
-    """All stacks that one template gives, or none."""
+    """Make all stacks of one template; there may be none."""
     rng = np.random.default_rng(np.random.SeedSequence(settings.seed, spawn_key=(number,)))
     design = draw_design(rng, settings.world, settings.template)
     if design.key in excluded:
         return []
     start = realize(design, rng, settings.world, settings.template)
-    judge = Judge(simulator, settings.accept, settings.settle_twice, settings.certificate)
+    settler = Settler(simulator, settings.accept, settings.settle_twice, settings.certificate)
     pictures = Pictures(settings.grid)
     samples = []
-    for removed, stack in deconstruct(start, judge, settings.max_removals):
+    for removed, stack in deconstruct(start, settler, settings.max_removals):
         if len(stack) > settings.max_blocks:
             continue
         poses = stack.poses.astype(np.float32)
@@ -275,10 +277,10 @@ def template_samples(
 
 @dataclass(frozen=True)
 class ShardTask:
-    """What a worker does: the shard of a number.
+    """The task of a worker: make the shard of a number.
 
     Args:
-        settings: Of the dataset.
+        settings: Settings of the dataset.
         excluded: Designs to leave out.
     """
 
@@ -337,7 +339,7 @@ def make_shards(
 
 
 def workshop_of(settings: GenerateSettings, out: Path) -> Workshop:
-    """Where the shards are made: what is drawn must not overwrite what it is drawn from."""
+    """Give the folder where the shards are made: a drawn shard must not overwrite what it is drawn from."""
     folder = out / PARTS if settings.draw else out
     folder.mkdir(exist_ok=True)
     return Workshop(folder)

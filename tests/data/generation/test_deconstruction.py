@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stackgen.data.generation.deconstruction import Judge, deconstruct, surely_falls
+from stackgen.data.generation.deconstruction import Settler, deconstruct, surely_falls
 from stackgen.data.generation.designs import Design, draw_design, realize
 from stackgen.geometry import block_vertices, tilt
 from stackgen.sim.checkers import AcceptLimits, accept, fell
@@ -31,14 +31,14 @@ def simulator() -> Iterator[Simulator]:
 @pytest.fixture(scope="module")
 def families(simulator: Simulator) -> list[tuple[Stack, Family]]:
     """Four templates that stand, and all that is left of them."""
-    judge = Judge(simulator, LIMITS, settle_twice=True)
+    settler = Settler(simulator, LIMITS, settle_twice=True)
     found: list[tuple[Stack, Family]] = []
     rng = np.random.default_rng(3)
     while len(found) < 4:
         template = realize(draw_design(rng, PAPER_WORLD), rng, PAPER_WORLD)
         if len(template) > 9:
             continue
-        family = list(deconstruct(template, judge))
+        family = list(deconstruct(template, settler))
         if len(family) > 3:
             found.append((template, family))
     return found
@@ -121,35 +121,35 @@ def test_what_is_kept_differs(families: list[tuple[Stack, Family]]) -> None:
 
 
 def test_the_number_of_removals_is_a_setting(simulator: Simulator) -> None:
-    judge = Judge(simulator, LIMITS, settle_twice=False)
+    settler = Settler(simulator, LIMITS, settle_twice=False)
     table = of("0@0,0@1,0@2/2@0/2@0/1@0,0@2")
-    ways = [[removed for removed, _ in deconstruct(table, judge, most)] for most in range(3)]
+    ways = [[removed for removed, _ in deconstruct(table, settler, most)] for most in range(3)]
     assert ways[0] == [()]
     assert len(ways[0]) < len(ways[1]) < len(ways[2])
     assert ways[2][: len(ways[1])] == ways[1]
 
 
 def test_the_last_block_of_the_top_row_stays(simulator: Simulator) -> None:
-    judge = Judge(simulator, LIMITS, settle_twice=False)
+    settler = Settler(simulator, LIMITS, settle_twice=False)
     tower = of("2@0/2@0/2@0/1@0,0@2")
-    ways = {removed for removed, _ in deconstruct(tower, judge)}
+    ways = {removed for removed, _ in deconstruct(tower, settler)}
     assert ways == {(), (3,), (4,)}  # either of the top row, never both; each lower one carries all
 
 
 def test_a_design_that_falls_gives_nothing(simulator: Simulator) -> None:
-    judge = Judge(simulator, LIMITS, settle_twice=False)
-    assert list(deconstruct(of("0@0/2@0/2@0/2@0"), judge)) == []
+    settler = Settler(simulator, LIMITS, settle_twice=False)
+    assert list(deconstruct(of("0@0/2@0/2@0/2@0"), settler)) == []
 
 
 def test_settling_twice_is_stricter_and_settling_is_what_it_says(simulator: Simulator) -> None:
-    once, twice = (Judge(simulator, LIMITS, settle_twice=t) for t in (False, True))
+    once, twice = (Settler(simulator, LIMITS, settle_twice=t) for t in (False, True))
     stack = of("2@0/1@0,0@2/2@0/3@1")
     rollout = simulator.rollout(stack)
     settled, again = once.settle(stack), twice.settle(stack)
     assert settled is not None and again is not None
     assert (settled.stack.poses == rollout.end.poses).all()
     assert (again.stack.poses == simulator.rollout(rollout.end).end.poses).all()
-    assert Judge(simulator, AcceptLimits(displacement=1e-9), False).settle(stack) is None
+    assert Settler(simulator, AcceptLimits(displacement=1e-9), False).settle(stack) is None
 
 
 # The short cuts past the simulator.
@@ -168,18 +168,18 @@ class Counting:
         return self.simulator.rollout(stack, **options)  # type: ignore[arg-type]
 
 
-def certified(simulator: Simulator | Counting, **margins: float) -> Judge:
-    return Judge(simulator, LIMITS, settle_twice=True, certificate=replace(StaticsMargins(), **margins))  # type: ignore[arg-type]
+def certified(simulator: Simulator | Counting, **margins: float) -> Settler:
+    return Settler(simulator, LIMITS, settle_twice=True, certificate=replace(StaticsMargins(), **margins))  # type: ignore[arg-type]
 
 
 def test_with_the_certificate_the_family_of_a_sure_design_is_the_same_but_for_what_has_no_margin(
     families: list[tuple[Stack, Family]], simulator: Simulator
 ) -> None:
     counting = Counting(simulator)
-    judge = certified(counting)
+    settler = certified(counting)
     sure = both = differ = 0
     for template, family in families:
-        ways, simulated = {way for way, _ in deconstruct(template, judge)}, {way for way, _ in family}
+        ways, simulated = {way for way, _ in deconstruct(template, settler)}, {way for way, _ in family}
         if ways:  # else the design is one at its limit
             sure += 1
             both += len(ways & simulated)
@@ -207,11 +207,11 @@ def test_what_is_certain_to_stand_stays_where_it_was(
 def test_a_family_does_not_depend_on_what_was_judged_before(
     families: list[tuple[Stack, Family]], simulator: Simulator
 ) -> None:
-    judge = certified(simulator, inset=0.05)  # more that is unsure
+    settler = certified(simulator, inset=0.05)  # more that is unsure
     (first, _), (second, _) = families[:2]
 
     def content(template: Stack) -> list[tuple[tuple[int, ...], bytes]]:
-        return [(way, stack.poses.tobytes()) for way, stack in deconstruct(template, judge, 2)]
+        return [(way, stack.poses.tobytes()) for way, stack in deconstruct(template, settler, 2)]
 
     alone = content(second)
     content(first)
@@ -233,9 +233,9 @@ def test_only_sure_designs_are_built_unless_one_says_otherwise(simulator: Simula
 def test_what_leans_is_no_data_even_if_it_stands(simulator: Simulator) -> None:
     """A cube beside its support comes to lean on a pillar."""
     leaning = upright((0, 0, 0.5), (0, 0.51, 1.5), (0, 1.53, 0.5), (0, 1.53, 1.5))
-    simulated, judge = Judge(simulator, LIMITS, settle_twice=True), certified(simulator, sure_designs=False)
+    simulated, settler = Settler(simulator, LIMITS, settle_twice=True), certified(simulator, sure_designs=False)
     assert simulated.settle(leaning) is not None
-    assert judge.settle(leaning) is None
+    assert settler.settle(leaning) is None
 
 
 def test_what_surely_falls_is_never_what_the_simulator_accepts(
