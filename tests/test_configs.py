@@ -22,7 +22,9 @@ from stackgen.data.datamodule import StackDataModule
 from stackgen.data.generation.generate import GenerateSettings
 from stackgen.models.block_list.module import BlockListCNN
 from stackgen.models.diffusion.module import DDPM
-from stackgen.models.weights import last_checkpoint, load_sampler
+from stackgen.models.weights import last_checkpoint
+from stackgen.sampling.methods import load_sampler
+from stackgen.world import PAPER_WORLD
 from tests.conftest import Cli
 
 CONFIGS = Path(__file__).parents[1] / "configs"
@@ -86,9 +88,7 @@ def build(
     parser.add_argument("--callbacks", type=list[Callback])
     chosen = {"model": options["model"], "data": options["data"], "callbacks": options["trainer"]["callbacks"]}
     made = parser.instantiate_classes(parser.parse_object(chosen))
-    if world is not None:
-        made.model.catalogue, made.model.grid, made.model.max_blocks = world.catalogue, world.grid, world.max_blocks
-    made.model.build()
+    made.model.build(PAPER_WORLD if world is None else world.world)
     return made.model, made.data, made.callbacks
 
 
@@ -154,7 +154,7 @@ def test_the_paper_s_denoiser_is_the_paper_s(fit_options: Load) -> None:
     assert model.denoiser.encode(torch.zeros(1, 64, 64)).shape == (1, 16, 512)
     assert size(model.denoiser.head) == 512 * 6 + 6
     assert size(model) == 20_105_222
-    assert module.max_blocks == 10
+    assert module.world.max_blocks == 10
     assert model.config.prediction == "epsilon" and model.config.clip is None
     beta = model.schedule.beta
     assert model.schedule.steps == 50

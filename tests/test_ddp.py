@@ -12,9 +12,9 @@ import pytest
 import torch
 
 from stackgen.data.datamodule import StackDataModule
-from stackgen.data.loading.order import exact_batches
-from stackgen.models.diffusion.denoiser import DenoiserConfig
+from stackgen.data.loading.passes import exact_batches
 from stackgen.models.diffusion.module import DDPM
+from stackgen.models.transformer import TransformerConfig
 from tests.conftest import CHILD, write_towers
 
 pytestmark = pytest.mark.slow
@@ -23,12 +23,12 @@ pytestmark = pytest.mark.slow
 CONFIG = """
 name: many
 trainer: {{max_epochs: 4, accelerator: cpu, log_every_n_steps: 1, enable_progress_bar: false,
-          enable_model_summary: false, callbacks: [{{class_path: stackgen.training.callbacks.EMA}},
-          {{class_path: stackgen.training.callbacks.SampleQuality, init_args: {{every_n_epochs: 2, num_scenes: 12}}}},
+          enable_model_summary: false, callbacks: [{{class_path: stackgen.training.EMA}},
+          {{class_path: stackgen.training.SampleQuality, init_args: {{every_n_epochs: 2, num_scenes: 12}}}},
           {{class_path: lightning.pytorch.callbacks.ModelCheckpoint,
             init_args: {{every_n_epochs: 2, save_top_k: -1, save_last: true, filename: "{{epoch}}"}}}}]}}
 model:
-  class_path: stackgen.baselines.tran_reg_module.TranReg
+  class_path: stackgen.baselines.TranReg
   init_args:
     transformer: {{width: 32, layers: 1, heads: 2, feedforward: 64, conditioning: cross, mask_padding: true,
                   ordered: true}}
@@ -113,7 +113,7 @@ SHORT = """
 trainer: {{max_epochs: 2, accelerator: cpu, log_every_n_steps: 1, enable_progress_bar: false,
           enable_model_summary: false, accumulate_grad_batches: 2}}
 model:
-  class_path: stackgen.models.diffusion.module.DDPM
+  class_path: stackgen.models.DDPM
   init_args: {{denoiser: {{width: 32, layers: 1, heads: 2, feedforward: 64}}}}
 data: {{path: {data}, bucket_by_blocks: true, eval_batch_size: 2}}
 """
@@ -140,7 +140,7 @@ def test_machines_with_short_shares_wait_for_nobody_and_weigh_them_right(tmp_pat
 def validated(run: Path, data: Path) -> tuple[torch.Tensor, torch.Tensor]:
     """Loss and quarter of the noise steps of each validation scene, as the machines of a run draw their noise."""
     content = torch.load(run / "checkpoints" / "last.ckpt", weights_only=True)
-    module = DDPM(DenoiserConfig(width=32, layers=1, heads=2, feedforward=64))
+    module = DDPM(TransformerConfig(width=32, layers=1, heads=2, feedforward=64))
     module.on_load_checkpoint(content)
     module.load_state_dict(content["state_dict"])
     module.eval()

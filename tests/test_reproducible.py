@@ -10,6 +10,7 @@ import pytest
 import torch
 import yaml
 
+from stackgen.data.dataset import Dataset
 from stackgen.models.diffusion.module import DDPM
 from tests.conftest import Cli
 
@@ -23,11 +24,11 @@ trainer:
   enable_progress_bar: false
   enable_model_summary: false
   callbacks:
-    - {{class_path: stackgen.training.callbacks.EMA, init_args: {{decay: 0.9}}}}
+    - {{class_path: stackgen.training.EMA, init_args: {{decay: 0.9}}}}
     - class_path: lightning.pytorch.callbacks.ModelCheckpoint
       init_args: {{every_n_train_steps: 4, save_top_k: -1, save_last: true, filename: "{{step}}"}}
 model:
-  class_path: stackgen.models.diffusion.module.DDPM
+  class_path: stackgen.models.DDPM
   init_args:
     denoiser: {{width: 32, layers: 1, heads: 2, feedforward: 64, conditioning: cross, memory_layers: 1,
                mask_padding: true, ordered: true, self_conditioning: true}}
@@ -129,11 +130,9 @@ def test_another_seed_is_another_training(cli: Cli, config: Path) -> None:
 def test_a_run_says_what_made_it(cli: Cli, config: Path, towers_dataset: Path) -> None:
     import json
 
-    from stackgen.data.shards import Manifest, manifest_sha256
-
     assert cli("fit", "--config", config, "--trainer.max_steps", 1, "--dashboard", "none").code == 0
     folder = Path("runs/twice/version_0")
     facts = json.loads((folder / "run.json").read_text())
     assert facts["code"].startswith("0.")
-    assert facts["dataset"]["sha256"] == manifest_sha256(Manifest.load(towers_dataset).to_json())
+    assert facts["dataset"]["sha256"] == Dataset.open(towers_dataset).manifest.sha256
     assert yaml.safe_load((folder / "config.yaml").read_text())["model"]["init_args"]["draws"] == 2
