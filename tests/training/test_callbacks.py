@@ -18,6 +18,7 @@ from stackgen.data.arrays import Batch, StackArrays
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette
 from stackgen.protocols import StabilityChecker, Verdict
+from stackgen.sim.physics import Physics
 from stackgen.stack import Stack, shapes_of
 from stackgen.training.callbacks import EMA, RAW_WEIGHTS, Compile, SampleQuality, StepMetrics, Throughput
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Mask
@@ -220,6 +221,8 @@ class Row:
 
 class Floor(StabilityChecker):
     """A checker by which everything above the ground falls."""
+
+    physics = Physics()
 
     def check(self, stack: Stack) -> Verdict:
         fell = stack.poses[:, 2] > 1
