@@ -103,7 +103,7 @@ class GreedyRandom(Heuristic):
 def layer_runs(silhouette: Mask, level: int, grid: Grid) -> list[Interval]:
     """Find the runs of pixels at half the height of a layer, from left to right.
 
-    >>> layer_runs(np.pad(np.ones((14, 28), bool), ((46, 4), (18, 18))), 0, PAPER_GRID)
+    >>> layer_runs(np.pad(np.ones((14, 28), bool), ((46, 4), (18, 18))), 0, Grid())
     [(-1.0, 1.0)]
     """
     row = int(np.argmin(np.abs(grid.vertical("front") - level - 0.5)))

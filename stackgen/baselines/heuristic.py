@@ -97,7 +97,7 @@ def random_stream(seed: int, silhouette: Mask, block_list: NDArray[np.int64], nu
 def section(shape: Shape) -> float:
     """Measure the width of an upright block at half its height [cell].
 
-    >>> section(PAPER_CATALOGUE[3])  # the triangle
+    >>> section(PAPER_WORLD.catalogue[3])  # the triangle
     0.5
     """
     left, right = row_intervals(np.asarray(shape.outline), np.zeros(1))

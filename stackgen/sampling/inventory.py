@@ -35,6 +35,7 @@ def inventory_counts(inventory: Inventory, catalogue: Catalogue) -> NDArray[np.i
     Raises:
         StackgenError: On an unknown shape, a negative number, or no block at all.
 
+    >>> from stackgen.world import PAPER_CATALOGUE
     >>> inventory_counts("cube=40, triangle=1", PAPER_CATALOGUE).tolist()
     [40, 0, 0, 1]
     """
