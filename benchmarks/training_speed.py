@@ -26,7 +26,7 @@ import yaml
 from benchmarks.common import ROOT, argument_parser, peak_rss_mb, plain_table, report, run_child, start
 
 if TYPE_CHECKING:
-    from stackgen.data.loading.arrays import StackArrays
+    from stackgen.data.arrays import StackArrays
     from stackgen.models.diffusion.module import DDPM
 
 NETWORKS = ("config", "joint", "torch", "plain")
@@ -101,8 +101,7 @@ def measure(options: argparse.Namespace, network: str, threads: int) -> dict[str
     import torch
     from lightning.pytorch import Trainer
 
-    from stackgen.data.datamodule import TESTSET
-    from stackgen.data.loading.arrays import load_dataset
+    from stackgen.data.dataset import TESTSET, Dataset
     from stackgen.training.callbacks import EMA
 
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
@@ -111,7 +110,7 @@ def measure(options: argparse.Namespace, network: str, threads: int) -> dict[str
     torch.manual_seed(0)
     config = yaml.safe_load((ROOT / options.config).read_text())
     data, settings = config["data"], config["trainer"]
-    stacks = load_dataset(TESTSET, ("test",))[0]["test"]
+    stacks = Dataset.open(TESTSET).split("test")
     arrays = stacks.select(np.tile(np.arange(len(stacks)), REPEATS))
     loader = loader_of(arrays, data, plain=network == "plain")
     module = build(config["model"]["init_args"], network)
@@ -152,7 +151,7 @@ def loader_of(arrays: StackArrays, data: dict[str, Any], plain: bool) -> Any:
     import numpy as np
     from torch.utils.data import DataLoader
 
-    from stackgen.data.datamodule import CachedLoader
+    from stackgen.data.loading.cached import CachedLoader
 
     if not plain:
         options = {name: data.get(name, False) for name in ("bucket_by_blocks", "mirror")}
@@ -166,13 +165,14 @@ def build(init_args: dict[str, Any], network: str) -> DDPM:
     """The training module of a configuration, with its own network or one of the other two."""
     from torch import Tensor, nn
 
-    from stackgen.models.diffusion.denoiser import DenoiserConfig
     from stackgen.models.diffusion.module import DDPM
     from stackgen.models.diffusion.network import DiffusionConfig
     from stackgen.models.diffusion.schedules import ScheduleConfig
     from stackgen.models.optimization import OptimizerConfig
+    from stackgen.models.transformer import TransformerConfig
+    from stackgen.world import PAPER_WORLD
 
-    denoiser = DenoiserConfig(**init_args["denoiser"])
+    denoiser = TransformerConfig(**init_args["denoiser"])
     if network != "config":
         denoiser = dataclasses.replace(
             denoiser,
@@ -190,13 +190,13 @@ def build(init_args: dict[str, Any], network: str) -> DDPM:
         OptimizerConfig(**init_args.get("optimizer", {})),
         init_args.get("draws", 1) if network == "config" else 1,  # the joint encoder gains nothing from several
     )
-    module.build()
+    module.build(PAPER_WORLD)
     if network in ("torch", "plain"):
 
         class TorchEncoder(nn.Module):
             """All layers as one of Denoiser's."""
 
-            def __init__(self, c: DenoiserConfig) -> None:
+            def __init__(self, c: TransformerConfig) -> None:
                 super().__init__()
                 layer = nn.TransformerEncoderLayer(c.width, c.heads, c.feedforward, c.dropout, batch_first=True)
                 self.encoder = nn.TransformerEncoder(layer, c.layers)

@@ -6,8 +6,9 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from stackgen.api import Model
 from stackgen.commands.cli import main
 from stackgen.evaluation.metrics import SCENE_METRICS
 from stackgen.stack import Stack, shapes_of
-from stackgen.world import Mask
+from stackgen.world import PAPER_WORLD, Mask
 
 settings.register_profile("patient", deadline=None)  # on a busy machine the slowest example says nothing
 settings.load_profile("patient")
@@ -68,6 +69,10 @@ def allow_interrupts() -> None:
 class TowerSampler:
     """Puts the blocks on top of each other, each a little to one side as the seed says."""
 
+    world = PAPER_WORLD
+    settings: Mapping[str, Any] = MappingProxyType({})
+    card: Mapping[str, Any] = MappingProxyType({})
+
     def sample_batch(
         self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
     ) -> list[list[Stack]]:
@@ -86,6 +91,9 @@ class TowerSampler:
 
 class ThreeCubes:
     """Predicts three cubes, whatever the silhouette."""
+
+    world = PAPER_WORLD
+    card: Mapping[str, Any] = MappingProxyType({})
 
     def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """(B, top, S) block lists."""
@@ -119,16 +127,16 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> TinyWeights:
 
     from stackgen.models.block_list.module import BlockListCNN
     from stackgen.models.block_list.network import CNNConfig
-    from stackgen.models.diffusion.denoiser import DenoiserConfig
     from stackgen.models.diffusion.module import DDPM
+    from stackgen.models.transformer import TransformerConfig
     from stackgen.models.weights import write_weights
 
     folder = tmp_path_factory.mktemp("weights")
     torch.manual_seed(0)
-    ddpm = DDPM(DenoiserConfig(width=32, layers=1, heads=2, feedforward=64))
+    ddpm = DDPM(TransformerConfig(width=32, layers=1, heads=2, feedforward=64))
     cnn = BlockListCNN(CNNConfig(channels=8, layers=1, stem_stride=4, pool=8, hidden=16))
     for name, module in (("ddpm", ddpm), ("cnn", cnn)):
-        module.build()
+        module.build(PAPER_WORLD)
         write_weights(folder / f"{name}.safetensors", module.model.state_dict(), module.card())
     return TinyWeights(folder / "ddpm.safetensors", folder / "cnn.safetensors")
 
@@ -171,10 +179,11 @@ def towers_dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def write_towers(folder: Path, sizes: dict[str, int]) -> Path:
     """Write a dataset of towers of one to three cubes, a shard for each split."""
-    from stackgen.data.shards import Manifest, Sample, write_shard
+    from stackgen.data.manifest import Manifest
+    from stackgen.data.shards import Sample, write_shard
     from stackgen.geometry import silhouette
     from stackgen.sim.physics import Physics
-    from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID
+    from stackgen.world import PAPER_GRID
 
     folder.mkdir(exist_ok=True)
     rng = np.random.default_rng(0)
@@ -185,11 +194,11 @@ def write_towers(folder: Path, sizes: dict[str, int]) -> Path:
             stack = TowerSampler._tower(np.array([1 + i % 3, 0, 0, 0]), rng)
             poses = stack.poses.astype(np.float32)
             meta = {"template": 100 * number + i, "layout": "", "removed": []}
-            picture = silhouette(stack.with_poses(poses))
+            picture = silhouette(stack.with_poses(poses), PAPER_GRID)
             samples.append(Sample(f"{number}{i:04d}", stack.shapes.astype(np.uint8), poses, picture, meta))
         entries.append(write_shard(folder / f"{split}-{number:06d}.tar", samples))
     physics = Physics().to_json()
-    Manifest("towers", 0, PAPER_CATALOGUE, PAPER_GRID, MAX_BLOCKS, physics, {}, tuple(entries)).save(folder)
+    Manifest("towers", 0, PAPER_WORLD, physics, {}, tuple(entries)).save(folder)
     return folder
 
 

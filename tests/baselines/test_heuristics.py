@@ -47,7 +47,7 @@ def test_every_block_of_the_list_gets_a_pose(name: str, scenes: tuple[Mask, np.n
 
 
 @every_heuristic
-def test_same_seed_same_stacks_whoever_else_is_in_the_batch(name: str, scenes: tuple[Mask, np.ndarray]) -> None:
+def test_same_seed_same_stacks_whatever_else_is_in_the_batch(name: str, scenes: tuple[Mask, np.ndarray]) -> None:
     pictures, lists = scenes
     method = HEURISTICS[name]()
     together = method.sample_batch(pictures, lists, 3, 5)
