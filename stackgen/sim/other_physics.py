@@ -1,4 +1,4 @@
-"""Stacks, weights and verdicts of different physics are not mixed unnoticed: who reads another's says so, once.
+"""One warning where stacks, weights or verdicts were made with other physics than those in use.
 
 Settings are compared in their plain form, as manifests, cards and reports carry them.
 """
@@ -14,7 +14,7 @@ _said: set[str] = set()
 
 
 def physics_differences(made: Mapping[str, Any], here: Mapping[str, Any]) -> list[str]:
-    """What differs between two physics; a setting that one of them does not know is no difference.
+    """List what differs between two physics; a setting that only one of them knows is no difference.
 
     >>> physics_differences({"friction": 0.3, "watch": 2.0}, {"friction": 0.5, "watch": 2, "engine": "pybullet 3"})
     ['friction 0.3 instead of 0.5']
@@ -30,9 +30,9 @@ def warn_of_other_physics(what: str, made: Mapping[str, Any] | None, here: Mappi
     """Say in one line, once, if something was made with other physics than those here.
 
     Args:
-        what: Was made.
-        made: Its physics, if that is known.
-        here: Of whoever reads it.
+        what: What was made, as the message names it.
+        made: Physics it was made with, if that is known.
+        here: Physics in use.
     """
     differences = physics_differences(made or {}, here)
     line = f"{what} was made with other physics than are used here: {', '.join(differences)}"
@@ -42,5 +42,5 @@ def warn_of_other_physics(what: str, made: Mapping[str, Any] | None, here: Mappi
 
 
 def _absent(*physics: Mapping[str, Any]) -> bool:
-    """Whether one of them has no engine: a machine that only trains."""
+    """Tell whether one of them has no engine: a machine that only trains."""
     return any(str(settings["engine"]).endswith("absent") for settings in physics)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from stackgen.data.dataset import Dataset
-from stackgen.data.provenance import physics_differences, warn_of_other_physics
+from stackgen.sim.other_physics import physics_differences, warn_of_other_physics
 from tests.conftest import Cli
 
 
