@@ -56,7 +56,7 @@ COMMAND = Command(
     stackgen sweep --config configs/sweeps/ddpm.yaml --run_cap 60 --out runs/sweeps/longer
     stackgen sweep --config configs/sweeps/ddpm.yaml --export_wandb > sweep.yaml
     """,
-    settings=("sweep", Sweep),
+    settings={"sweep": Sweep},
     flags={"export_wandb": "Print the file for `wandb sweep` instead of running it."},
     interpolation=False,  # `${args}` of a sweep file is for W&B
 )
