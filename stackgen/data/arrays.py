@@ -91,7 +91,7 @@ class StackArrays:
         return np.unpackbits(packed, axis=1).view(bool).reshape(-1, self.image_size, self.image_size)
 
     def select(self, indices: ArrayLike | slice) -> StackArrays:
-        """The stacks at `indices`, in that order."""
+        """Select the stacks at `indices`, in that order."""
         i = indices if isinstance(indices, slice) else np.asarray(indices)
         return StackArrays(self.shapes[i], self.poses[i], self.silhouettes[i], self.template[i], self.num_shapes)
 
@@ -99,7 +99,7 @@ class StackArrays:
         """Mean (6,) and standard deviation (6,) of the poses of all blocks [cell, rad].
 
         Args:
-            mirror: Of the stacks together with their mirror images.
+            mirror: Whether to count their mirror images as well.
         """
         real = self.poses[self.shapes != PADDING].astype(np.float64)
         if mirror:
@@ -108,11 +108,11 @@ class StackArrays:
 
     @cached_property
     def tensors(self) -> StackTensors:
-        """The same as tensors, sharing memory."""
+        """The same stacks as tensors that share their memory."""
         return StackTensors.of(self)
 
     def batch(self, indices: ArrayLike) -> Batch:
-        """The batch of the stacks at `indices` (B,), padded to N; see :meth:`StackTensors.batch`."""
+        """Gather the stacks at `indices` (B,) into a batch, padded to N; see :meth:`StackTensors.batch`."""
         return self.tensors.batch(torch.as_tensor(np.asarray(indices, dtype=np.int64)))
 
     @staticmethod
@@ -146,12 +146,12 @@ class StackArrays:
 
 
 class Buffers:
-    """Memory for float pictures on the CPU, used again once nobody holds what was made of it.
+    """Memory for float pictures on the CPU, used again once no batch holds it.
 
-    64 MB a batch of 4096: to ask the system for them anew costs more than to fill them.
+    64 MB a batch of 4096: new memory from the system costs more than filling it.
 
     Args:
-        most: Buffers kept; whoever holds more batches than this gets fresh memory.
+        most: Number of buffers kept; beyond that batches get fresh memory.
     """
 
     def __init__(self, most: int = 4) -> None:
@@ -216,7 +216,7 @@ class StackTensors:
         return StackTensors(**tensors, buffers=buffers or Buffers())
 
     def to(self, device: torch.device | str) -> StackTensors:
-        """The same on another device."""
+        """Move the tensors to another device."""
         names = ("shapes", "poses", "silhouettes", "counts", "template")
         return StackTensors(**{name: getattr(self, name).to(device) for name in names}, buffers=self.buffers)
 
@@ -263,7 +263,7 @@ class StackTensors:
 
 
 def _look_up(table: Tensor, bytes_: Tensor) -> Tensor:
-    """What a table of 256 entries says of each byte."""
+    """Look each byte up in a table of 256 entries."""
     return table.to(bytes_.device).index_select(0, bytes_.reshape(-1).int()).view(bytes_.shape)
 
 

@@ -36,8 +36,8 @@ def write_card(folder: Path, manifest: Manifest, measured: Sequence[str] = ()) -
     """Write a dataset's card; a README.md that is not ours is left alone.
 
     Args:
-        folder: Of the dataset.
-        manifest: Its manifest.
+        folder: Folder of the dataset.
+        manifest: Manifest of the dataset.
         measured: Paragraphs on what is in it, for the section of that name.
 
     Returns:
@@ -54,7 +54,7 @@ def write_card(folder: Path, manifest: Manifest, measured: Sequence[str] = ()) -
 
 
 def dataset_card(manifest: Manifest, measured: Sequence[str] = ()) -> str:
-    """The text of a card, Markdown."""
+    """Write the text of a card in Markdown."""
     stacks = sum(manifest.count(split) for split in SPLITS)
     example = manifest.shards[0]["file"] if manifest.shards else "train-000000.tar"
     reading = _READING.format(shard=example, pixels=manifest.world.grid.image_size)
@@ -82,7 +82,7 @@ def dataset_card(manifest: Manifest, measured: Sequence[str] = ()) -> str:
 
 
 def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table whose first column is text and whose others are figures.
+    """Lay out a table whose first column is text and whose others are numbers.
 
     >>> print(markdown_table(["a", "b"], [["x", "1"]]))
     | a | b |
@@ -143,7 +143,7 @@ def _blocks(manifest: Manifest) -> str:
 
 
 def _physics(manifest: Manifest) -> str:
-    rows = [[name, _figure(value)] for name, value in manifest.physics.items()]
+    rows = [[name, _number(value)] for name, value in manifest.physics.items()]
     return (
         "A verdict holds for these numbers alone; lengths in metres unless stackgen's docs/physics.md says cells.\n\n"
         + markdown_table(["setting", "value"], rows)
@@ -160,5 +160,5 @@ def _limits(manifest: Manifest) -> str:
     )
 
 
-def _figure(value: Any) -> str:
+def _number(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -181,7 +181,7 @@ class StackDataModule(pl.LightningDataModule):
         return self._exact_loader("test")
 
     def predict_dataloader(self) -> Iterable[Batch]:
-        """The same as for the test."""
+        """The test split once, in order."""
         return self.test_dataloader()
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The bytes of shards to arrays, a whole shard at once: some twenty times as fast as sample by sample.
+"""Decoding of shards to arrays, a whole shard at once: some 25 times as fast as sample by sample.
 
 The manifest says what a sample must be; one that is not so is left out and named, never silently. The checksum
 of the whole shard must have been compared before: a sample that is altered and still one is not noticed here.
@@ -231,7 +231,7 @@ def decode_shards(shards: Sequence[Shard], world: World, log: SkipLog) -> StackA
     Args:
         shards: The shards; their order is kept.
         world: World of the dataset.
-        log: Told of broken samples.
+        log: Counts and names the broken samples.
 
     Raises:
         StackgenError: If a shard is damaged, which is found before anything was begun; or if there is no sample.

@@ -1,4 +1,4 @@
-"""A dataset split again into other shares: the same stacks, those that belong together on one side."""
+"""Splitting a dataset again: the same stacks in other shares, and those that belong together in one split."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Resplit:
         validation, test: Shares of these splits, counted in groups; what is left is for training.
         by: What stays together: `template`, all stacks deconstructed from one template; `layout`, those of all
             templates that are the same design or its mirror image, so that no design is on two sides.
-        seed: Another one, another choice of groups.
+        seed: Seed of the choice of groups.
 
     Raises:
         StackgenError: If the shares make no sense.
@@ -48,10 +48,10 @@ class Resplit:
 
 
 def resplit(folder: Path, out: Path, how: Resplit, progress: Callable[[int], None] | None = None) -> Manifest:
-    """Write a dataset anew with other splits.
+    """Write a new dataset of the same stacks with other splits.
 
     Args:
-        folder: Of the dataset; it is left alone.
+        folder: Folder of the dataset, which is not changed.
         out: A folder that is not there yet; it appears when it is complete.
         how: The shares, and what stays together.
         progress: Called with the number of shards that were read.
@@ -114,7 +114,7 @@ def _shards(folder: Path, manifest: Manifest) -> Iterator[list[Sample]]:
 
 
 def _group(sample: Sample, by: By, manifest: Manifest) -> Any:
-    """What a sample shares with those it must stay with."""
+    """Name the group of samples that a sample must stay with."""
     if by == "template":
         return sample.meta["template"]
     design = _canonical(sample.meta.get("layout"), manifest.world)
@@ -136,7 +136,7 @@ def _canonical(layout: str | None, world: World) -> str | None:
 def split_table(
     folder: Path, manifest: Manifest, progress: Callable[[int], None] | None = None
 ) -> dict[str, dict[str, int]]:
-    """By split the number of stacks, of templates, of designs, and of designs that another split has, too.
+    """Count by split the number of stacks, of templates, of designs, and of designs that another split has, too.
 
     A design and its mirror image count as one.
 

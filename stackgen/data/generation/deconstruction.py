@@ -33,13 +33,13 @@ class Settled:
 
     @property
     def outcome(self) -> Outcome:
-        """What is known of it without simulating."""
+        """What is known of the stack without a simulation."""
         if self.statics is not None:
             return self.statics.outcome(self.part)
         return "falls" if surely_falls(self.stack) else "unsure"
 
     def less(self, place: int) -> Settled:
-        """What is left when one block is taken out; whether it stands is another question."""
+        """Take one block out; the rest may stand or fall."""
         keep = np.delete(np.arange(len(self.stack)), place)
         stack = Stack(self.stack.shapes[keep], self.stack.poses[keep], self.stack.catalogue)
         return Settled(stack, self.part[keep], self.statics)
@@ -50,7 +50,7 @@ class Settler:
     """Settles a stack and says whether it may be data.
 
     Args:
-        simulator: Of the dataset's catalogue and physics.
+        simulator: Simulator with the dataset's physics.
         limits: See AcceptLimits.
         settle_twice: Simulate the settled stack again, from a fresh start: it must stand once more, unless
             statics confirms that it does. The paper settles once; a marginal stack or two then slips in.
@@ -63,13 +63,13 @@ class Settler:
     certificate: StaticsMargins = NEVER
 
     def settle(self, stack: Stack) -> Settled | None:
-        """A design at rest, or None. Whatever is known of it, it is put down first: designs are not at rest."""
+        """Settle a design; None if it is not accepted. Designs are not at rest, so even a sure one is simulated."""
         outcome = self._known(stack).outcome
         sure = outcome == "stands" or not (self.certificate.enabled and self.certificate.sure_designs)
         return self._simulated(stack) if sure and outcome != "falls" else None
 
     def settle_rest(self, rest: Settled) -> Settled | None:
-        """What is left of a settled stack, at rest; or None. What is certain to stand is at rest where it is."""
+        """Settle the rest of a settled stack; None if it falls. A rest that surely stands is at rest already."""
         match rest.outcome:
             case "stands":
                 return rest
@@ -100,10 +100,10 @@ class Settler:
 
 
 def deconstruct(template: Stack, settler: Settler, max_removals: int = 4) -> Iterator[tuple[tuple[int, ...], Stack]]:
-    """The template and what is left of it after every way of taking blocks out, as long as it stands.
+    """Settle a design, then take blocks out in every way, as long as the rest stands.
 
     Blocks are taken out one at a time, from settled and stable stacks only; what two orders of removal
-    both reach is judged once. The top row keeps at least one block, so every stack keeps its height.
+    both reach is settled once. The top row keeps at least one block, so every stack keeps its height.
 
     Yields:
         The numbers of the removed blocks and the settled rest, fewest removals first.
@@ -130,7 +130,7 @@ def deconstruct(template: Stack, settler: Settler, max_removals: int = 4) -> Ite
 
 
 def surely_falls(stack: Stack, reach: float = 0.1, slack: float = 0.05) -> bool:
-    """Whether a block of a nearly upright stack hangs in the air, or one that bears nothing has its
+    """Tell whether a block of a nearly upright stack hangs in the air, or one that bears nothing has its
     centre of mass beside its supports. Half of all removals end so; this spares the simulator them.
 
     Args:

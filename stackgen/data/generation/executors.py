@@ -1,8 +1,8 @@
-"""Who makes the shards: processes of this machine, or a Ray cluster.
+"""Executors that make the shards: processes of this machine, or a Ray cluster.
 
 An executor maps a function over numbers and hands the results over as they come, in any order. It asks for
-the next number only when it has a process free, so the numbers may be endless: whoever has enough stops
-asking. What the function answers depends on its number alone, so nothing depends on the executor.
+the next number only when it has a process free, so the numbers may be endless: the caller stops
+asking when it has enough. What the function answers depends on its number alone, so nothing depends on the executor.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ class Executor(Protocol):
 
 
 def make_executor(name: ExecutorName, workers: int | None = None) -> Executor:
-    """An executor by its name.
+    """Make an executor by its name.
 
     Args:
         name: `local` or `ray`.
-        workers: Processes; by default one for each core, of this machine or of the cluster.
+        workers: Number of processes; by default one for each core, of this machine or of the cluster.
 
     Raises:
         StackgenError: If there is no such executor, or less than one worker.
@@ -62,7 +62,7 @@ def make_executor(name: ExecutorName, workers: int | None = None) -> Executor:
 
 @dataclass(frozen=True)
 class _Answer:
-    """What a worker sends back: a result, or the error that there is none for."""
+    """Message of a worker: a result, or the error in its place."""
 
     result: Any = None
     error: Exception | None = None
@@ -89,7 +89,7 @@ class LocalExecutor:
     given to the next; each has a pipe of its own, so that no process can leave a lock behind.
 
     Args:
-        workers: How many.
+        workers: Number of processes.
     """
 
     workers: int
@@ -125,7 +125,7 @@ class LocalExecutor:
 def _given_up(number: int) -> StackgenError:
     return StackgenError(
         f"generate: {ATTEMPTS} worker processes died over shard {number}, killed perhaps for want of memory; "
-        "whole shards are kept: run the command again, with fewer --workers if memory is short"
+        "finished shards are kept: run the command again, with fewer --workers if memory is short"
     )
 
 
@@ -158,7 +158,7 @@ def _next(worker: _Worker, waiting: Iterator[int]) -> bool:
 
 
 def _receive(worker: _Worker) -> _Answer | None:
-    """The answer of a worker, None if it died over it."""
+    """Receive the answer of a worker, None if it died."""
     try:
         return worker.pipe.recv()
     except (EOFError, OSError):
@@ -167,7 +167,7 @@ def _receive(worker: _Worker) -> _Answer | None:
 
 
 def _work(task: Callable[[int], T], pipe: Connection) -> None:
-    """In the process: answer numbers until there is nobody to ask."""
+    """Answer numbers in the worker process until the pipe is closed."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     with contextlib.suppress(EOFError, OSError):
         while True:

@@ -239,7 +239,7 @@ def _designs_of(path: Path, world: World) -> frozenset[str]:
 
 
 def _revived(kind: type[Any], plain: Mapping[str, Any]) -> Any:
-    """A dataclass of dataclasses from its plain form; what is no longer plain is taken as it is."""
+    """Make a dataclass of dataclasses from its plain form; values that are dataclasses already are kept."""
     hints = get_type_hints(kind)
     unknown = set(plain) - {item.name for item in fields(kind)}
     if unknown:
@@ -289,7 +289,7 @@ class ShardTask:
 
     @staticmethod
     def of(settings: GenerateSettings) -> ShardTask:
-        """The task of a dataset."""
+        """Make the task of a dataset."""
         return ShardTask(settings, testset_designs(settings.world) if settings.exclude_testset else frozenset())
 
     def __call__(self, shard: int) -> MadeShard:
@@ -346,7 +346,7 @@ def workshop_of(settings: GenerateSettings, out: Path) -> Workshop:
 
 
 def _are(settings: GenerateSettings, plain: Any) -> bool:
-    """Whether a plain manifest without shards is that of some settings, with what it does not say filled in."""
+    """Tell whether a plain manifest without shards has these settings, where defaults stand for what it lacks."""
     try:
         manifest = Manifest.from_json(plain)
         same = manifest.settings.get("revision", REVISION) == REVISION
@@ -380,4 +380,4 @@ def _store(folder: Path, shard: MadeShard) -> ShardEntry:
 
 
 def _ignore(_: object) -> None:
-    """Nobody wants to know."""
+    """Stand in for a callback that was not given."""

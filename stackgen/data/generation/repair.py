@@ -27,7 +27,7 @@ class Repaired:
 
     Args:
         identical: Shards that are again as they were written.
-        other: Shards that were made anew with other bytes, because that was asked for.
+        other: Shards that were made again with other bytes, as requested.
     """
 
     identical: tuple[str, ...] = ()
@@ -43,8 +43,8 @@ def repair(
     """Make the shards again that are missing or damaged; all others are left alone.
 
     Args:
-        folder: Of the dataset.
-        executor: Who makes them; by default processes of this machine.
+        folder: Folder of the dataset.
+        executor: Runs their making; by default on processes of this machine.
         other_bytes: Accept shards that are not what was written, as another version of the simulator makes
             them; the manifest then gets their checksums.
         progress: Called with the number of shards that were made again, and of those that must be.
@@ -86,7 +86,7 @@ def repair(
 
 
 def _settings(manifest: Manifest, other_bytes: bool) -> GenerateSettings:
-    """The generator's settings, if it can be expected to make the same bytes."""
+    """Give the generator's settings, if it can be expected to make the same bytes."""
     if "resplit" in manifest.settings:
         raise StackgenError(
             f"dataset {manifest.name!r} was made by `stackgen dataset split`: repair its source and split that again"
@@ -104,7 +104,7 @@ _SAME = "other versions of numpy or another kind of machine"
 
 
 def _difference(manifest: Manifest) -> str:
-    """In what this generator differs from the one that made a dataset."""
+    """Say how this generator differs from the one that made a dataset."""
     engine, revision = manifest.physics.get("engine"), manifest.settings.get("revision", 1)
     if engine != engine_version():
         return f"it was made with {engine}, here is {engine_version()}"
@@ -116,12 +116,12 @@ def _difference(manifest: Manifest) -> str:
 def _made(
     folder: Path, manifest: Manifest, settings: GenerateSettings, numbers: list[int], executor: Executor
 ) -> Iterator[tuple[int, MadeShard]]:
-    """The shards of some numbers, made again."""
+    """Make the shards of some numbers again."""
     if not settings.draw:
         with contextlib.closing(executor.map(ShardTask.of(settings), numbers)) as made:
             yield from made
         return
-    parts = folder / PARTS  # as in the generation: a repair that is cut off goes on from there
+    parts = folder / PARTS  # as in the generation: an interrupted repair continues from there
     parts.mkdir(exist_ok=True)
     entries = make_shards(settings, Workshop(parts), executor)
     yield numbers[0], draw(parts, entries, settings)
@@ -129,7 +129,7 @@ def _made(
 
 
 def _cut(shard: MadeShard, samples: int) -> MadeShard:
-    """The last shard of a dataset was cut to its first samples."""
+    """Cut a shard to its first samples, as the last one of a dataset was."""
     if shard.samples <= samples:
         return shard
     kept = list(iterate_shard(shard.content))[:samples]

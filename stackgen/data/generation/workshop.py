@@ -1,4 +1,4 @@
-"""A dataset's folder while it is made: whose it is, which shards are whole, what is swept away at the end.
+"""The folder of a dataset while it is made: which settings it has, which shards are whole, what is removed at the end.
 
 Every file appears under its final name only when it is whole. A shard counts as made once its entry is
 recorded beside it, in `progress/`; whatever a kill leaves without entry, or not as its entry says, is made
@@ -40,7 +40,7 @@ class Workshop:
     """The shards of a folder and the record of those that are whole.
 
     Args:
-        folder: Where they are.
+        folder: Folder of the shards.
     """
 
     folder: Path
@@ -51,10 +51,10 @@ class Workshop:
         return self.folder / PROGRESS
 
     def whole(self, say: Callable[[str], None], only: range | None = None) -> dict[int, ShardEntry]:
-        """Entries of the shards that are as they were written, by number.
+        """Find the entries of the shards that are as they were written, by number.
 
         Args:
-            say: Told of each that is not.
+            say: Called with a line about each that is not.
             only: Look at these numbers alone.
         """
         found = {}
@@ -122,7 +122,7 @@ def _json(text: str) -> Any:
 
 
 def finished(out: Path) -> Manifest | None:
-    """The manifest of a dataset that is complete, None if it is still to be made.
+    """Give the manifest of a dataset that is complete, None if it is still to be made.
 
     Raises:
         StackgenError: If it was complete once, but a shard is missing or damaged.
@@ -161,5 +161,5 @@ def disk_may_be_full(out: Path) -> Iterator[None]:
             raise
         raise StackgenError(
             f"disk full: {out} keeps the shards that are whole; free some space and run the same command again, "
-            "it goes on from there"
+            "it continues from there"
         ) from error

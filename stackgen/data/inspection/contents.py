@@ -1,6 +1,6 @@
 """What is in a dataset: counts, distributions, duplicates, and how near it is to the frozen test scenes.
 
-Needs no simulator: whoever wants margins hands over a checker. Legend: M stacks, N blocks at most.
+Needs no simulator: margins come from a checker that is handed in. Legend: M stacks, N blocks at most.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Contents:
         arrays: M stacks, split by split.
         split: (M,) number of each one's split.
         depth: (M,) blocks removed from its template, -1 where that is not recorded (in a compact file).
-        manifest: Of the dataset.
+        manifest: Manifest of the dataset.
     """
 
     arrays: StackArrays
@@ -66,7 +66,7 @@ class Contents:
         return Contents(arrays, number, depth, dataset.manifest)
 
     def of(self, split: str) -> StackArrays:
-        """The stacks of one split."""
+        """Select the stacks of one split."""
         return self.arrays.select(np.flatnonzero(self.split == SPLITS.index(split)))
 
     def stack(self, index: int) -> Stack:
@@ -100,14 +100,14 @@ def facts(
     margins: int = 500,
     seed: int = 0,
 ) -> dict[str, Any]:
-    """All figures of a dataset, as JSON allows. Shares lie in [0, 1].
+    """Collect all facts about a dataset, as JSON allows. Shares lie in [0, 1].
 
     Args:
         contents: The dataset.
         testset: Folder of the frozen test scenes; None leaves the comparison out.
         checker: Gives the margins; None leaves them out.
-        margins: Stacks whose margin is asked for.
-        seed: Of their draw.
+        margins: Number of stacks whose margin is computed.
+        seed: Seed of their draw.
     """
     manifest = contents.manifest
     found: dict[str, Any] = {
@@ -125,7 +125,7 @@ def facts(
 
 
 def counts(contents: Contents) -> dict[str, dict[str, int]]:
-    """How many stacks, or blocks, there are of each kind."""
+    """Count the stacks, or blocks, of each kind."""
     arrays, catalogue = contents.arrays, contents.manifest.world.catalogue
     real = arrays.shapes != PADDING
     heights = np.array([shape.size[2] for shape in catalogue])[np.where(real, arrays.shapes, 0)]
@@ -151,7 +151,7 @@ def counts(contents: Contents) -> dict[str, dict[str, int]]:
 
 
 def distributions(contents: Contents) -> dict[str, Floats]:
-    """Of all blocks: how far each is from its place in the design, its yaw and its tilt."""
+    """Measure of all blocks the distance from their place in the design, yaw and tilt."""
     arrays = contents.arrays
     real = arrays.shapes != PADDING
     poses = arrays.poses[real].astype(np.float64)
@@ -242,7 +242,7 @@ def _sorted_poses(arrays: StackArrays, group: NDArray[np.int64]) -> Floats:
 
 
 def nearness(contents: Contents, testset: Path) -> dict[str, Any] | None:
-    """How much of the frozen test scenes the training split holds already; None in another world.
+    """Measure how much of the frozen test scenes the training split holds already; None in another world.
 
     A mirror image counts as held, since training may mirror.
     """
@@ -292,7 +292,7 @@ def nearest_silhouettes(train: NDArray[np.uint8], test: NDArray[np.uint8], image
     words, areas = words[order], areas[order]
 
     def best_of(scene: NDArray[np.uint64], area: int, least: float) -> float:
-        """The best IoU among silhouettes whose area alone allows at least so much."""
+        """Find the best IoU among silhouettes whose area alone allows at least so much."""
         first, last = np.searchsorted(areas, (area * least, area / least))
         common = np.bitwise_count(words[first:last] & scene).sum(axis=1, dtype=np.int64)
         return float((common / np.maximum(areas[first:last] + area - common, 1)).max(initial=0.0))

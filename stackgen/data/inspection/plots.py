@@ -1,4 +1,4 @@
-"""The figures of a dataset for people: drawn, and as paragraphs of its card."""
+"""What is in a dataset, for people: plots, and paragraphs of its card."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ def draw_facts(path: Path, contents: Contents, found: Mapping[str, Any], margins
     """Draw counts and distributions as one PNG.
 
     Args:
-        path: To write.
+        path: File to write.
         contents: The dataset.
-        found: Its figures, of :func:`stackgen.data.inspection.contents.facts`.
-        margins: Of some stacks [degrees], if known.
+        found: Facts about it, from :func:`stackgen.data.inspection.contents.facts`.
+        margins: Margins of some stacks [degrees], if known.
 
     Raises:
         StackgenError: If it cannot be written.
@@ -83,12 +83,12 @@ def _style(axes: Axes, name: str) -> None:
 
 
 def draw_samples(contents: Contents, number: int = 24, seed: int = 0) -> Picture:
-    """A contact sheet of random stacks.
+    """Draw a contact sheet of random stacks.
 
     Args:
         contents: The dataset.
-        number: Of stacks, at most.
-        seed: Of the draw.
+        number: Largest number of stacks.
+        seed: Seed of the draw.
     """
     size = min(number, len(contents.arrays))
     chosen = np.sort(np.random.default_rng(seed).choice(len(contents.arrays), size, replace=False))
@@ -98,11 +98,11 @@ def draw_samples(contents: Contents, number: int = 24, seed: int = 0) -> Picture
 
 
 def paragraphs(found: Mapping[str, Any], pictures: Sequence[str] = ()) -> list[str]:
-    """The figures as Markdown.
+    """Write the facts as Markdown.
 
     Args:
-        found: Of :func:`stackgen.data.inspection.contents.facts`.
-        pictures: Names of those that lie beside the card.
+        found: Facts from :func:`stackgen.data.inspection.contents.facts`.
+        pictures: Names of the pictures beside the card.
     """
     parts = [f"![{name.partition('.')[0]}]({name})" for name in pictures]
     parts += [_tally(name, tally) for name, tally in found["counts"].items()]
@@ -121,7 +121,7 @@ def _distributions(found: Mapping[str, Any]) -> str:
 
 
 def margin_words(found: Mapping[str, Any]) -> str:
-    """How stable the stacks are, in words; empty where that was not asked."""
+    """Say how stable the stacks are; empty where that is not known."""
     margins = found.get("margins")
     if not margins:
         return ""
@@ -137,7 +137,7 @@ def margin_words(found: Mapping[str, Any]) -> str:
 
 
 def duplicate_words(found: Mapping[str, Any]) -> str:
-    """How many stacks are there twice, in words."""
+    """Say how many stacks are there twice."""
     twins = found["duplicates"]
     return (
         f"Duplicates (same shapes, all poses within {SAME:g} cell and rad): {twins['stacks']:,} stacks have a twin, "
@@ -146,7 +146,7 @@ def duplicate_words(found: Mapping[str, Any]) -> str:
 
 
 def nearness_words(found: Mapping[str, Any]) -> list[str]:
-    """How near the frozen test scenes are to the training split, in words; empty where that was not asked."""
+    """Say how near the frozen test scenes are to the training split; empty where that is not known."""
     if "testset" not in found:
         return []
     near = found["testset"]

@@ -80,9 +80,9 @@ def layout_codes(
 
     Args:
         stacks: M of them.
-        world: Their world.
+        world: World of the stacks.
         positions: Add the cell in which each block begins.
-        mirrored: Of the mirror images.
+        mirrored: Whether to take the mirror images.
     """
     grid, real = world.grid, stacks.shapes != PADDING
     shapes = np.where(real, stacks.shapes, 0).astype(np.int32)
@@ -98,7 +98,7 @@ def layout_codes(
 
 
 def share_in_common(seen: NDArray[np.bool_]) -> str:
-    """How many of how many, in words.
+    """Say how many of how many.
 
     >>> share_in_common(np.array([True, False, True, True]))
     '3 of 4 (75.0 %)'

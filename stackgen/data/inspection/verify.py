@@ -1,4 +1,4 @@
-"""Is a dataset what was written, to the last bit, and is every stack in it one?"""
+"""Verifying a dataset: every shard against its checksum, and every stack readable."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Problem:
     """Something that is wrong with a dataset.
 
     Args:
-        file: Its name.
+        file: Name of the file.
         fault: `missing`; `truncated`, cut off; `altered`, bytes changed; `unreadable`, a sample is not what the
             format says; `wrong`, the manifest contradicts itself or the shards; `foreign`, no part of the dataset.
         detail: More about it, in words.
@@ -40,7 +40,7 @@ class Problem:
 
     @property
     def breaks_bytes(self) -> bool:
-        """Whether a shard is not as it was written: what a repair can mend."""
+        """Whether a shard is not as it was written, so that a repair can help."""
         return self.fault in ("missing", "truncated", "altered")
 
 
@@ -48,7 +48,7 @@ def verify(folder: Path, progress: Callable[[int], None] | None = None) -> list[
     """Compare every shard with its checksum and read every sample.
 
     Args:
-        folder: Of the dataset.
+        folder: Folder of the dataset.
         progress: Called with the number of shards that have been looked at.
 
     Returns:
@@ -69,7 +69,7 @@ def verify(folder: Path, progress: Callable[[int], None] | None = None) -> list[
 
 @dataclass(frozen=True)
 class _Seen:
-    """Where keys and templates were met so far: a key is unique, a template on one side only."""
+    """Shards of the keys and splits of the templates met so far: a key is unique, a template in one split only."""
 
     keys: dict[bytes, str]
     splits: dict[int, str]
