@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,11 @@ from stackgen.vision.drawings import grid_offset
 from stackgen.world import Mask, World
 
 
+@dataclass(frozen=True)
 class AlignedSampler:
     """A StackSampler that shows another each structure on the cells of its grid, and moves the answer back."""
 
-    def __init__(self, sampler: StackSampler) -> None:
-        self.sampler = sampler
+    sampler: StackSampler
 
     @property
     def world(self) -> World:

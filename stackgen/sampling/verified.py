@@ -229,6 +229,7 @@ def checker_named(name: CheckerName, simulator: StabilityChecker) -> StabilityCh
     raise StackgenError(f"verify: the checker is simulator or statics, not {name!r}")
 
 
+@dataclass(frozen=True)
 class VerifiedSampler:
     """A StackSampler that asks another for more than is wanted, has them checked and keeps the best.
 
@@ -244,14 +245,10 @@ class VerifiedSampler:
         name: Name of the checker, for the record.
     """
 
-    def __init__(
-        self,
-        sampler: StackSampler,
-        checker: StabilityChecker,
-        budget: Budget = Budget(),
-        name: str = "",
-    ) -> None:
-        self.sampler, self.checker, self.budget, self.name = sampler, checker, budget, name
+    sampler: StackSampler
+    checker: StabilityChecker
+    budget: Budget = Budget()
+    name: str = ""
 
     @property
     def world(self) -> World:
