@@ -142,7 +142,7 @@ def test_checkpoint_export_and_module_sample_alike(
     assert all((first == other).all() for other in others)
     exported: Any = samplers[2]
     assert card["kind"] == method == exported.card["kind"] and card["dataset"]["name"] == "towers"
-    assert exported.catalogue == module.catalogue and exported.grid == module.grid and exported.max_blocks == 10
+    assert exported.world == module.world == PAPER_WORLD
     mean, std = data.pose_statistics()
     assert module.model.mean.numpy() == pytest.approx(mean, abs=1e-6)
     assert module.model.std.numpy() == pytest.approx(np.maximum(std, 0.05), rel=1e-4)
