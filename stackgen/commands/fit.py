@@ -25,11 +25,11 @@ from lightning.pytorch.cli import ArgsType, LightningArgumentParser, LightningCL
 from stackgen.commands.old_names import renew
 from stackgen.commands.parsing import CONFIG_FLAGS, HelpFormatter, epilog, option_values, own_sections, parse
 from stackgen.data.datamodule import StackDataModule
-from stackgen.data.provenance import warn_of_other_physics
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_json
 from stackgen.models.weights import CHECKPOINT_KEY, last_checkpoint
 from stackgen.protocols import StabilityChecker
+from stackgen.sim.other_physics import warn_of_other_physics
 from stackgen.sim.physics import Physics
 from stackgen.training.callbacks import SampleQuality, StepMetrics, Throughput
 from stackgen.training.loggers import CheckpointArtifact, Dashboard, log_configuration, loggers
@@ -41,6 +41,15 @@ EXAMPLES = {
 stackgen fit --config configs/model/ddpm-small.yaml --data.path data/paper
 stackgen fit --config configs/model/ddpm-small.yaml --data.path data/paper --ckpt_path last""",
     "validate": "stackgen validate --ckpt_path runs/ddpm-small/version_0/checkpoints/last.ckpt",
+}
+DESCRIPTIONS = {
+    "fit": "Train a model; its checkpoints, curves and configuration go to a new folder in runs.",
+    "validate": "Validate a model on the validation split; its metrics go to a new folder in runs.",
+}
+CHECKPOINTS = {
+    "fit": "Checkpoint to resume from: a file, or `last` for the newest of the runs of this name. Without --config, the"
+    " configuration beside it is used.",
+    "validate": "Checkpoint to validate, a file. Without --config, the configuration beside it is used.",
 }
 
 
@@ -91,7 +100,10 @@ def _command_line(kind: type[StackgenCLI], arguments: list[str]) -> None:
         "allow_abbrev": False,
         "formatter_class": HelpFormatter,
     }
-    verbs = {verb: {**common, "epilog": epilog(example)} for verb, example in EXAMPLES.items()}
+    verbs = {
+        verb: {**common, "description": DESCRIPTIONS[verb], "epilog": epilog(example)}
+        for verb, example in EXAMPLES.items()
+    }
     kind(
         LightningModule,
         StackDataModule,
@@ -127,6 +139,12 @@ class StackgenCLI(LightningCLI):
             default="wandb",
             help="Where fit's curves and pictures go, beside metrics.csv: wandb is offline without WANDB_API_KEY.",
         )
+
+    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
+        """Describe `--ckpt_path` as it is here."""
+        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        next(action for action in parser._actions if action.dest == "ckpt_path").help = CHECKPOINTS[subcommand]
+        return parser
 
     def parse_arguments(self, parser: LightningArgumentParser, args: ArgsType) -> None:
         """Parse; find a checkpoint's configuration beside it, and the checkpoint that `last` means."""

@@ -206,7 +206,7 @@ class SampleQuality(pl.Callback):
     scenes as `sample/scenes`. Without a checker, which the command line sets, only what needs no physics is logged.
 
     Args:
-        every_n_epochs: Validations from one sampling to the next; 0 never samples.
+        every_n_epochs: Epochs from one sampling to the next, of those that validate; 0 never samples.
         num_scenes: Number of scenes, the first of the validation split, over all processes.
         num_samples: Number of stacks per scene.
         seed: Seed of the sampler, the same each time, so that epochs compare.
