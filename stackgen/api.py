@@ -48,6 +48,9 @@ class Model:
             it is needed.
         weights: Where the sampler's weights came from, for the record.
         checker: Says which stacks stand; PyBullet by default.
+
+    Raises:
+        StackgenError: If the sampler does not say which world it knows.
     """
 
     def __init__(
@@ -58,6 +61,8 @@ class Model:
         weights: Weights | None = None,
         checker: StabilityChecker | None = None,
     ) -> None:
+        if not isinstance(getattr(sampler, "world", None), World):
+            raise StackgenError(f"the sampler {type(sampler).__name__} has no world: give it one, see StackSampler")
         self.sampler = sampler
         self.weights = weights
         self._predictor = predictor
@@ -284,7 +289,7 @@ class Model:
             return self._checker
         from stackgen.sim.checkers import SimulatorChecker  # training machines have no PyBullet
 
-        return SimulatorChecker(self.physics, self.world.catalogue)
+        return SimulatorChecker(self.physics)
 
     @property
     def physics(self) -> Physics:
@@ -292,7 +297,7 @@ class Model:
         from stackgen.sim.physics import Physics
 
         dataset = self.sampler.card.get("dataset") or {}
-        return Physics.of_world(dataset.get("physics"))
+        return Physics.recorded(dataset.get("physics"))
 
 
 def check(checker: StabilityChecker, stack: Stack, target: Mask | None, grid: Grid) -> StackEntry:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,14 +13,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import stackgen
-from stackgen.api import Model, _configured, judge
+from stackgen.api import Model, _configured, check
 from stackgen.errors import StackgenError
 from stackgen.geometry import mirror, silhouette
 from stackgen.io.stacks_file import read_stacks
 from stackgen.models.diffusion.settings import SPACING, SamplerConfig
 from stackgen.sampling.verified import Budget
 from stackgen.stack import Stack
-from stackgen.world import PAPER_GRID, Mask
+from stackgen.world import PAPER_GRID, PAPER_WORLD, Mask
 from tests.conftest import Cli, TinyWeights
 
 
@@ -25,6 +28,14 @@ def same(a: list[Stack], b: list[Stack]) -> bool:
     return all(
         np.array_equal(x.shapes, y.shapes) and np.array_equal(x.poses, y.poses) for x, y in zip(a, b, strict=True)
     )
+
+
+class KnowsThePapersWorld:
+    """What a sampler and a predictor say of themselves."""
+
+    world = PAPER_WORLD
+    settings: Mapping[str, Any] = MappingProxyType({})
+    card: Mapping[str, Any] = MappingProxyType({})
 
 
 @pytest.fixture
@@ -35,7 +46,7 @@ def model(tiny: TinyWeights) -> Model:
 def test_names_of_the_package_exist_and_unknown_ones_do_not() -> None:
     assert {"load", "sample", "Model"} <= set(dir(stackgen))
     assert all(getattr(stackgen, name) for name in stackgen.__all__)
-    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+    with pytest.raises(AttributeError, match="nothing"):
         _ = stackgen.nothing
 
 
@@ -77,11 +88,11 @@ def test_the_command_line_answers_as_the_library(
 def test_what_falls_has_no_iou_and_what_stands_has_its_silhouettes(towers: Model) -> None:
     tower = Stack(np.array([0, 0]), np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]]))
     floating = tower.with_poses(tower.poses + [0, 0, 2, 0, 0, 0])
-    target = silhouette(tower)
-    assert judge(towers.checker, tower, target).front_iou == pytest.approx(1, abs=0.02)
-    assert judge(towers.checker, floating, target).front_iou == 0
-    assert judge(towers.checker, tower).front_iou is None
-    assert judge(towers.checker, mirror(tower), np.fliplr(target)).front_iou == pytest.approx(1, abs=0.02)
+    target = silhouette(tower, PAPER_GRID)
+    assert check(towers.checker, tower, target, PAPER_GRID).front_iou == pytest.approx(1, abs=0.02)
+    assert check(towers.checker, floating, target, PAPER_GRID).front_iou == 0
+    assert check(towers.checker, tower, None, PAPER_GRID).front_iou is None
+    assert check(towers.checker, mirror(tower), np.fliplr(target), PAPER_GRID).front_iou == pytest.approx(1, abs=0.02)
 
 
 def test_progress_is_told_once_for_the_poses_and_once_a_verdict(towers: Model, tower_image: Path) -> None:
@@ -97,7 +108,12 @@ def test_a_model_without_predictor_asks_for_a_block_list(towers: Model, tower_im
         alone.sample(tower_image)
 
 
-class Remembers:
+def test_a_sampler_without_a_world_is_refused() -> None:
+    with pytest.raises(StackgenError, match="Worldless has no world"):
+        Model(type("Worldless", (), {"settings": {}, "card": {}})())
+
+
+class Remembers(KnowsThePapersWorld):
     """A sampler that keeps what it was shown and answers with a cube in the middle of the lowest row it saw."""
 
     def __init__(self) -> None:
@@ -113,7 +129,9 @@ class Remembers:
 
 
 def test_the_sampler_sees_the_structure_on_the_cells_of_its_grid_and_the_answer_moves_back() -> None:
-    tower = silhouette(Stack(np.array([0, 0, 0, 0]), np.array([[0, 0, z + 0.5, 0, 0, 0] for z in range(4)])))
+    tower = silhouette(
+        Stack(np.array([0, 0, 0, 0]), np.array([[0, 0, z + 0.5, 0, 0, 0] for z in range(4)])), PAPER_GRID
+    )
     sampler = Remembers()
     stacks = Model(sampler).sample(tower, num_samples=1, blocks="cube=4")
     assert sampler.seen is not None
@@ -136,7 +154,7 @@ def test_settings_are_for_diffusion_models_alone() -> None:
     assert isinstance(_configured(Remembers(), "heuristic", SamplerConfig()), Remembers)
 
 
-class Towers:
+class Towers(KnowsThePapersWorld):
     """Straight towers where the target is: they stand, but those of three blocks begin in the air."""
 
     def sample_batch(
@@ -153,7 +171,7 @@ class Towers:
         return scenes
 
 
-class TwoLists:
+class TwoLists(KnowsThePapersWorld):
     """Predicts three cubes, then four."""
 
     def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
@@ -162,7 +180,9 @@ class TwoLists:
         return np.tile(lists[:top], (len(silhouettes), 1, 1))
 
 
-FOUR = silhouette(Stack(np.zeros(4, dtype=np.int64), np.array([[0, 0, z + 0.5, 0, 0, 0] for z in range(4)])))
+FOUR = silhouette(
+    Stack(np.zeros(4, dtype=np.int64), np.array([[0, 0, z + 0.5, 0, 0, 0] for z in range(4)])), PAPER_GRID
+)
 
 
 @pytest.fixture
@@ -173,13 +193,13 @@ def four() -> Model:
 def test_verified_stacks_come_with_verdicts_and_what_was_spent(four: Model) -> None:
     steps: list[None] = []
     result = four.sample_verified(FOUR, 2, seed=3, blocks="cube=4", on_step=lambda: steps.append(None))
-    assert len(steps) == 3 and result.comment == "verified by simulator: 8 stacks drawn, 2 judged, 2 stable"
+    assert len(steps) == 3 and result.comment == "verified by simulator: 8 stacks drawn, 2 checked, 2 stable"
     assert result.sampler == {"verify": "simulator", "draws": 64}
     assert same(result.stacks, four.sample_verified(FOUR, 2, seed=3, blocks="cube=4").stacks)
     assert not same(result.stacks, four.sample_verified(FOUR, 2, seed=4, blocks="cube=4").stacks)
     for entry in result.entries:
         assert entry.verdict and entry.verdict.stable and not entry.comment
-        assert entry.front_iou == judge(four.checker, entry.stack, result.target).front_iou
+        assert entry.front_iou == check(four.checker, entry.stack, result.target, PAPER_GRID).front_iou
         assert entry.front_iou is not None and entry.front_iou > 0.95
 
 
@@ -223,7 +243,7 @@ def test_the_command_line_verifies_and_answers_by_its_exit_code(
     Image.fromarray(FOUR).save(tmp_path / "four.png")
     options = tmp_path / "four.png", "--num_samples", 2, "--out", tmp_path / "out"
     answer = cli("sample", "--blocks", "cube=4", "--verify", "--budget", "30s", *options)
-    assert answer.code == 0 and "four.png: verified by simulator: 8 stacks drawn, 2 judged, 2 stable" in answer.out
+    assert answer.code == 0 and "four.png: verified by simulator: 8 stacks drawn, 2 checked, 2 stable" in answer.out
     answer = cli("sample", "--blocks", "cube=3", "--verify", "simulator", "--budget", "8", *options)
     assert answer.code == 1 and "stack 1 falls: nothing stable was found for it" in answer.out
     assert read_stacks(tmp_path / "out" / "stacks.json").sampler == {"verify": "simulator", "draws": 8}

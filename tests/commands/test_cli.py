@@ -85,7 +85,7 @@ def test_images_of_one_name_do_not_overwrite_each_other(cli: Cli, towers: Model,
     (tmp_path / "other").mkdir()
     images = [draw_tower(tmp_path / name) for name in ("a.png", "other/a.png", "b.jpg")]
     assert cli("sample", *images, "--num_samples", 2, "--out", tmp_path / "out").code == 0
-    assert names(tmp_path / "out") == ["a", "a-2", "b"]
+    assert names(tmp_path / "out") == ["a", "a-2", "b", "overview.png"]
     assert all(names(tmp_path / "out" / name) == FILES for name in ("a", "a-2", "b"))
 
 
