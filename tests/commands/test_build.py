@@ -159,6 +159,8 @@ def test_a_build_leaves_report_stack_picture_and_film(cli: Cli, stacks: Path, tm
 
 def test_another_arm_builds_by_its_configuration_alone(cli: Cli, stacks: Path, tmp_path: Path) -> None:
     options = ("--config", CONFIG.with_name("panda.yaml"), "--grasp", "fixed", "--cell.staging.straighten", "false")
+    refused = cli("build", stacks, *options[:2], "--arm", "urscript", "--out", tmp_path / "real")
+    assert refused.code == 2 and "panda.urdf (cell.arm) is another arm" in refused.line
     answer = cli("build", stacks, *options, "--out", tmp_path / "out")
     assert answer.code == 0 and "built, and stands" in answer.out, answer.err
     report = json.loads((tmp_path / "out" / "build.json").read_text())

@@ -13,6 +13,7 @@ from rich.table import Table
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
 from stackgen.robot.backend import ArmBackend, execute
+from stackgen.robot.planning.arm_model import arm_model
 from stackgen.robot.planning.plan import BlockPlan, BuildPlan
 from stackgen.robot.real.build_progress import FILE, BuildProgress
 from stackgen.robot.real.gripper import Gripper
@@ -79,8 +80,11 @@ def prepare(
         resume: Whether the plan resumes the build in the folder.
 
     Raises:
-        StackgenError: If a motion leaves the workspace or is too fast, or the folder holds another build.
+        StackgenError: If it is no UR arm, a motion leaves the workspace or is too fast, or the folder holds another
+            build.
     """
+    if not arm_model(workcell.arm).like_ur5:
+        raise StackgenError(f"--arm: ur-rtde and urscript move UR arms; {workcell.arm.urdf} (cell.arm) is another arm")
     progress = BuildProgress.of(plan.stack, plan.order, workcell)
     if resume:
         found = BuildProgress.read(folder)
