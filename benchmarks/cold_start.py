@@ -64,7 +64,7 @@ def warm_runs(options: argparse.Namespace, folder: Path) -> tuple[float, dict[st
     """Seconds of the first call with its loading, of each stage of the later ones, and peak memory [MB]."""
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `stackgen sample` has it; torch reads it when it is imported
     begin = time.perf_counter()
-    from stackgen.api import judge, load
+    from stackgen.api import check, load
     from stackgen.commands.sample import write_result
 
     image, n = ROOT / options.image, options.num_samples
@@ -79,7 +79,7 @@ def warm_runs(options: argparse.Namespace, folder: Path) -> tuple[float, dict[st
         "image": lambda: model.read(image),
         "block list": lambda: options.blocks or model.predictor.predict(mask[None]),
         "sampler": lambda: model.sampler.sample_batch(mask[None], counts[None], n, 0),
-        "physics": lambda: [judge(model.checker, stack, mask, model.grid) for stack in result.stacks],
+        "physics": lambda: [check(model.checker, stack, mask, model.world.grid) for stack in result.stacks],
         "drawing and files": lambda: write_result(result, folder),
     }
     return first_call, {name: repeated(stage, options.runs) for name, stage in stages.items()}, peak_rss_mb()

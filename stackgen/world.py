@@ -113,6 +113,17 @@ class Shape:
         front = np.insert(corners, 1, -self.depth / 2, axis=1)
         return np.concatenate([front, front * [1, -1, 1]])
 
+    @property
+    def faces(self) -> list[list[int]]:
+        """The corners of each face as indices into `vertices`, counter-clockwise seen from outside.
+
+        >>> Shape("wedge", ((-1, -1), (1, -1), (0, 1))).faces
+        [[0, 1, 2], [5, 4, 3], [0, 3, 4, 1], [1, 4, 5, 2], [2, 5, 3, 0]]
+        """
+        n = len(self.outline)
+        sides = [[i, i + n, (i + 1) % n + n, (i + 1) % n] for i in range(n)]
+        return [list(range(n)), list(range(2 * n - 1, n - 1, -1)), *sides]
+
     @cached_property
     def is_box(self) -> bool:
         """Whether the prism fills its box."""

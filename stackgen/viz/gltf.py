@@ -16,7 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from stackgen.io.files import write_atomically
 from stackgen.stack import Stack
-from stackgen.viz.raster import prism_faces
 from stackgen.viz.render import Colour, shape_colour
 from stackgen.world import Shape
 
@@ -93,7 +92,7 @@ def prism_mesh(shape: Shape) -> tuple[NDArray[np.float64], NDArray[np.float64], 
     points: list[NDArray[np.float64]] = []
     normals: list[NDArray[np.float64]] = []
     triangles: list[tuple[int, int, int]] = []
-    for face in prism_faces(shape):
+    for face in shape.faces:
         corners, first = shape.vertices[face], sum(map(len, points))
         normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
         points.append(corners)

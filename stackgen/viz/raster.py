@@ -11,8 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.world import Shape
-
 Floats = NDArray[np.float64]
 
 
@@ -69,17 +67,6 @@ def camera_axes(azimuth: float, elevation: float) -> tuple[Floats, Floats, Float
     back = np.array([np.sin(azimuth) * np.cos(elevation), -np.cos(azimuth) * np.cos(elevation), np.sin(elevation)])
     right = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     return right, np.cross(back, right), back
-
-
-def prism_faces(shape: Shape) -> list[list[int]]:
-    """List the corners of each face of a prism as indices into its vertices, counter-clockwise seen from outside.
-
-    >>> prism_faces(Shape("wedge", ((-1, -1), (1, -1), (0, 1))))
-    [[0, 1, 2], [5, 4, 3], [0, 3, 4, 1], [1, 4, 5, 2], [2, 5, 3, 0]]
-    """
-    n = len(shape.outline)
-    sides = [[i, i + n, (i + 1) % n + n, (i + 1) % n] for i in range(n)]
-    return [list(range(n)), list(range(2 * n - 1, n - 1, -1)), *sides]
 
 
 def fill_nearest(

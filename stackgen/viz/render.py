@@ -21,7 +21,7 @@ from stackgen.geometry import block_vertices
 from stackgen.io.files import write_atomically
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
-from stackgen.viz.raster import Camera, borders, fill_nearest, prism_faces
+from stackgen.viz.raster import Camera, borders, fill_nearest
 from stackgen.world import Grid, Mask
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ def draw_faces(
     colours, owners = [np.zeros(3)], [-1]
     for block, (index, corners) in enumerate(zip(stack.shapes, blocks, strict=True)):
         base = np.array(shape_colour(index), dtype=np.float64)
-        for face in prism_faces(stack.catalogue[index]):
+        for face in stack.catalogue[index].faces:
             polygon = corners[face]
             normal = np.cross(polygon[1] - polygon[0], polygon[2] - polygon[0])
             if (camera.eye - polygon[0]) @ normal > 0:

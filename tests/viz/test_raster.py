@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stackgen.viz.raster import Camera, borders, fill_nearest, prism_faces
+from stackgen.viz.raster import Camera, borders, fill_nearest
 from stackgen.world import PAPER_CATALOGUE, Shape
 
 
@@ -46,7 +46,7 @@ def test_the_camera_sees_all_points_and_nearer_is_nearer() -> None:
 @pytest.mark.parametrize("shape", list(PAPER_CATALOGUE), ids=lambda shape: shape.name)
 def test_faces_are_planar_face_outwards_and_enclose_the_volume(shape: Shape) -> None:
     volume = 0.0
-    for face in prism_faces(shape):
+    for face in shape.faces:
         p = shape.vertices[face]
         normal = np.cross(p[1] - p[0], p[2] - p[0])
         assert np.abs((p - p[0]) @ normal).max() < 1e-9

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 
 from stackgen.geometry import rotation_matrices
 from stackgen.stack import Stack
-from stackgen.viz.raster import prism_faces
 from stackgen.world import Catalogue, Shape
 
 Floats = NDArray[np.float64]
@@ -282,7 +281,7 @@ def _cast(catalogue: Catalogue) -> _Molds:
 
 def _features(shape: Shape) -> tuple[Floats, Floats, Ints, Ints]:
     """Return vertices (V, 3), face normals (F, 3), face corners (F, C) and edges (E, 2) of a prism."""
-    faces = prism_faces(shape)
+    faces = shape.faces
     most = max(4, len(shape.outline))
     corners = np.array([face + face[:1] * (most - len(face)) for face in faces])
     origin, along, across = (shape.vertices[corners[:, i]] for i in range(3))
