@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -22,7 +22,7 @@ from stackgen.evaluation.report.results import Result, result_of, run_seconds
 from stackgen.evaluation.report.rows import LIST_NAMES, ReportSettings, check_rows, trainings
 from stackgen.evaluation.report.sheets import draw_sheets
 from stackgen.evaluation.report.store import Store
-from stackgen.evaluation.report.tables import Conditions, csv_rows, terminal_table, to_json, to_markdown
+from stackgen.evaluation.report.tables import Conditions, Report, csv_rows, terminal_table, to_json, to_markdown
 from stackgen.evaluation.report.tasks import Task, tasks_of
 from stackgen.evaluation.results import Evaluation, write_csv
 from stackgen.io.files import write_atomically, write_json
@@ -31,7 +31,6 @@ from stackgen.protocols import StabilityChecker
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
 from stackgen.training.runs import RUNS
-from stackgen.world import World
 
 ROWS = Path(__file__).parents[1] / "assets" / "report.yaml"
 """The paper's table, where no other rows are given."""
@@ -63,7 +62,7 @@ def main(
     if (limit is not None and limit < 1) or (workers is not None and workers < 1):
         raise StackgenError("report: limit and workers must be at least 1")
     everything, dataset = load_scenes(settings.test_set)
-    scenes, manifest, world = everything[:limit], dataset.manifest, dataset.world
+    scenes, manifest = everything[:limit], dataset.manifest
     physics = Physics.recorded(manifest.physics)
     with simulating(physics, workers or os.cpu_count() or 1) as checker:
         conditions = Conditions(
@@ -78,12 +77,14 @@ def main(
         )
         test_set = {"name": manifest.name, "sha256": manifest.sha256}
         facts = {"code": conditions.code, "machine": conditions.machine, "dataset": test_set}
-        tasks = tasks_of(settings, manifest, len(scenes), conditions.physics, facts)
+        tasks = tasks_of(settings, manifest, len(scenes), physics=conditions.physics, facts=facts)
         answers = gather(tasks, scenes, checker, Store(cache, runs), console)
     limits, unseen = _references(settings, conditions, console)
-    results = [result_of(task.row, answers[task.place], task.question, limits, unseen) for task in tasks]
+    results = [result_of(t.row, answers[t.place], t.question, limit=limits, unseen=unseen) for t in tasks]
+    pictures = draw_charts(results, out)
     whole = SimulatorChecker(physics)  # for the pictures: what falls, falls to the end
-    write_report(results, settings, conditions, unseen, scenes, world, whole, out)
+    pictures += draw_sheets(results, {scene.name: scene for scene in scenes}, whole, out, grid=dataset.world.grid)
+    write_report(Report(results, conditions, unseen, settings.groundwork), pictures, out)
     console.print(terminal_table(results))
     console.print(f"wrote {out}/table.md, .csv, .json and the pictures beside it", highlight=False)
     _tell_costs(results, settings, time.perf_counter() - began, console)
@@ -153,27 +154,15 @@ def _references(
     return limit, unseen
 
 
-def write_report(
-    results: Sequence[Result],
-    settings: ReportSettings,
-    conditions: Conditions,
-    unseen: Unseen | None,
-    scenes: Sequence[Scene],
-    world: World,
-    checker: StabilityChecker,
-    out: Path,
-) -> None:
-    """Write tables and pictures; the checker is asked once more about the samples that are drawn.
+def write_report(report: Report, pictures: Sequence[str], out: Path) -> None:
+    """Write the tables.
 
     Raises:
         StackgenError: If one cannot be written.
     """
-    by_name: Mapping[str, Scene] = {scene.name: scene for scene in scenes}
-    pictures = draw_charts(results, out) + draw_sheets(results, by_name, checker, out, world.grid)
-    write_json(out / "table.json", to_json(results, conditions, unseen, settings.groundwork))
-    write_csv(out / "table.csv", csv_rows(results))
-    text = to_markdown(results, conditions, unseen, pictures, settings.groundwork)
-    write_atomically(out / "table.md", text.encode())
+    write_json(out / "table.json", to_json(report))
+    write_csv(out / "table.csv", csv_rows(report))
+    write_atomically(out / "table.md", to_markdown(report, pictures).encode())
 
 
 def _tell_costs(results: Sequence[Result], settings: ReportSettings, spent: float, console: Console) -> None:

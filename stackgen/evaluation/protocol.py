@@ -190,7 +190,7 @@ def _evaluate_batch(
     stacks = request.sampler.sample_batch(silhouettes, block_lists, request.num_samples, seed)
     spent = time.perf_counter() - began
     each = spent / (request.num_samples * len(scenes))
-    found = check_scenes(scenes, stacks, checker, request.world, block_lists, ranks)
+    found = check_scenes(scenes, stacks, checker, request.world, block_lists=block_lists, ranks=ranks)
     return [replace(result, seconds=each) for result in found], spent
 
 
@@ -199,6 +199,7 @@ def check_scenes(
     stacks: Sequence[Sequence[Stack]],
     checker: StabilityChecker,
     world: World,
+    *,
     block_lists: NDArray[np.int64] | None = None,
     ranks: Sequence[int | None] | None = None,
 ) -> list[SceneResult]:

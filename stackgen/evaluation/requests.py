@@ -133,6 +133,11 @@ def load_method(method: Method) -> Loaded:
     """
     if not isinstance(method.weights, str):
         require_sampler(method.weights)
+    elif method.weights.lstrip().startswith("{"):  # what is no sampler is left as text by the parser
+        raise StackgenError(
+            f"weights {method.weights}: class_path names a class whose `sample_batch` is annotated as that of"
+            " stackgen.protocols.StackSampler, and init_args what it takes"
+        )
     model = load(method.weights, method.block_list_weights, method.sampler)
     own = model.weights.name if model.weights else type(model.sampler).__name__
     weights = method.weights if isinstance(method.weights, str) else own

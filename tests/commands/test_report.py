@@ -118,7 +118,7 @@ def test_the_shipped_rows_are_the_default_and_name_what_there_is() -> None:
     values = parser.instantiate(parser.parse_args([f"--config={yaml.safe_dump(content)}"]))
     check_rows(values.rows)
     manifest = Dataset.open(values.test_set).manifest
-    tasks = tasks_of(ReportSettings(rows=values.rows), manifest, 500, {}, {})
+    tasks = tasks_of(ReportSettings(rows=values.rows), manifest, 500, physics={}, facts={})
     assert [task.place[0] for task in tasks if task.request.block_list == TRUE_LIST] == [
         row.name for row in values.rows
     ]

@@ -109,6 +109,8 @@ def test_a_sampler_without_a_world_is_refused_in_one_line() -> None:
     for refuse in (require_sampler, lambda sampler: load_method(Method(sampler))):
         with pytest.raises(StackgenError, match="Worldless has no world and no card"):
             refuse(Worldless())
+    with pytest.raises(StackgenError, match="sample_batch"):
+        load_method(Method("{class_path: stackgen.stack.Stack}"))
 
 
 def test_scenes_of_another_world_are_refused() -> None:

@@ -74,7 +74,12 @@ class Result:
 
 
 def result_of(
-    row: Row, evaluation: Evaluation, question: Question, limit: DiversityLimit | None, unseen: Unseen | None
+    row: Row,
+    evaluation: Evaluation,
+    question: Question,
+    *,
+    limit: DiversityLimit | None = None,
+    unseen: Unseen | None = None,
 ) -> Result:
     """Compute all metrics of a row's answer.
 

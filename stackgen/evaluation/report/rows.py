@@ -78,7 +78,7 @@ class ReportSettings:
     """How the table is made.
 
     Args:
-        rows: Methods, in their order.
+        rows: Methods, in their order; by default those of the paper's table.
         groundwork: What comes before the rows when everything is made from scratch: data, block-list network.
         test_set: Dataset whose test scenes are asked about.
         num_samples: Samples of each scene.

@@ -68,7 +68,7 @@ def _spread(examples: Sequence[Example], number: int) -> list[Example]:
 
 
 def draw_sheets(
-    results: Sequence[Result], scenes: Mapping[str, Scene], checker: StabilityChecker, folder: Path, grid: Grid
+    results: Sequence[Result], scenes: Mapping[str, Scene], checker: StabilityChecker, folder: Path, *, grid: Grid
 ) -> list[str]:
     """Draw a picture for each row, of its last block list; answer the lines of Markdown that show them.
 

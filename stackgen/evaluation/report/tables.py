@@ -60,24 +60,40 @@ class Conditions:
     machine: str
 
 
-def to_json(
-    results: Sequence[Result], conditions: Conditions, unseen: Unseen | None, groundwork: Sequence[Training] = ()
-) -> dict[str, Any]:
+@dataclass(frozen=True)
+class Report:
+    """All that the tables show.
+
+    Args:
+        results: Results in the order of the rows.
+        conditions: What they hold for.
+        unseen: Scenes that are looked at on their own, if they are known.
+        groundwork: What comes before the rows when everything is made from scratch.
+    """
+
+    results: Sequence[Result]
+    conditions: Conditions
+    unseen: Unseen | None = None
+    groundwork: Sequence[Training] = ()
+
+
+def to_json(report: Report) -> dict[str, Any]:
     """Give the plain form of the whole report."""
+    unseen = report.unseen
     return {
         "format": FORMAT,
-        **asdict(conditions),
-        "test_set": dict(zip(("name", "sha256"), conditions.test_set, strict=True)),
+        **asdict(report.conditions),
+        "test_set": dict(zip(("name", "sha256"), report.conditions.test_set, strict=True)),
         "interval": "95 %, cluster bootstrap over scenes",
         "unseen": unseen and {"training_sets": unseen.names, "sha256": sorted(unseen.hashes), "notions": NOTIONS},
-        "groundwork": [asdict(training) for training in groundwork],
-        "rows": [result.to_json() for result in results],
+        "groundwork": [asdict(training) for training in report.groundwork],
+        "rows": [result.to_json() for result in report.results],
     }
 
 
-def csv_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
+def csv_rows(report: Report) -> list[dict[str, Any]]:
     """Make one line for each row, block list and set of scenes, in percent; empty where a metric does not exist."""
-    return [_csv_row(result, subset) for result in results for subset in result.metrics]
+    return [_csv_row(result, subset) for result in report.results for subset in result.metrics]
 
 
 def _csv_row(result: Result, subset: str) -> dict[str, Any]:
@@ -105,29 +121,16 @@ def _blank(value: float | None) -> float | str:
     return "" if value is None else value
 
 
-def to_markdown(
-    results: Sequence[Result],
-    conditions: Conditions,
-    unseen: Unseen | None,
-    pictures: Sequence[str],
-    groundwork: Sequence[Training] = (),
-) -> str:
-    """Write the page `table.md`.
-
-    Args:
-        results: Results in the order of the rows.
-        conditions: What they hold for.
-        unseen: Scenes that are looked at on their own.
-        pictures: Lines of Markdown that show the pictures.
-        groundwork: What comes before the rows when everything is made from scratch.
-    """
-    parts = [_head(conditions)]
+def to_markdown(report: Report, pictures: Sequence[str]) -> str:
+    """Write the page `table.md`; `pictures` are the lines of Markdown that show the pictures."""
+    results = report.results
+    parts = [_head(report.conditions)]
     for kind in KINDS:
         some = [result for result in results if result.row.kind == kind]
         if some:
-            parts += [f"## {SECTIONS[kind]}", *_section(some, unseen)]
-    parts += [*_block_lists(results), "## Pictures", *pictures, *_sources(results), *_from_scratch(results, groundwork)]
-    return "\n\n".join(parts) + "\n"
+            parts += [f"## {SECTIONS[kind]}", *_section(some, report.unseen)]
+    parts += [*_block_lists(results), "## Pictures", *pictures, *_sources(results)]
+    return "\n\n".join([*parts, *_from_scratch(results, report.groundwork)]) + "\n"
 
 
 def _head(conditions: Conditions) -> str:

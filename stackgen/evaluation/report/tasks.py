@@ -34,7 +34,7 @@ class Task(NamedTuple):
 
 
 def tasks_of(
-    settings: ReportSettings, manifest: Manifest, scenes: int, physics: Mapping[str, Any], facts: Mapping[str, Any]
+    settings: ReportSettings, manifest: Manifest, scenes: int, *, physics: Mapping[str, Any], facts: Mapping[str, Any]
 ) -> list[Task]:
     """Load what the rows name, and say what is asked of each.
 

@@ -30,7 +30,7 @@ from stackgen.evaluation.report.results import ALL, Result, result_of
 from stackgen.evaluation.report.rows import Row, Training, check_rows
 from stackgen.evaluation.report.sheets import pick_examples
 from stackgen.evaluation.report.store import Store, differences, key_of, other_conditions
-from stackgen.evaluation.report.tables import Conditions, csv_rows, to_json, to_markdown
+from stackgen.evaluation.report.tables import Conditions, Report, csv_rows, to_json, to_markdown
 from stackgen.evaluation.requests import Method
 from stackgen.evaluation.results import (
     PREDICTED_LIST,
@@ -154,7 +154,7 @@ def test_equal_conditions_have_no_remark() -> None:
 def result(answered: Evaluation, unseen: Unseen | None = None) -> Result:
     known = {"00000-t1": {ONE, OTHER}, "00001-t1": {ONE, THIRD, OTHER}}
     limit = DiversityLimit({(name, (2, 1, 0, 0)): frozenset(layouts) for name, layouts in known.items()})
-    return result_of(ROW, answered, question(), limit, unseen)
+    return result_of(ROW, answered, question(), limit=limit, unseen=unseen)
 
 
 def value(estimate: Estimate | None) -> float:
@@ -253,26 +253,27 @@ def test_tables_hold_every_row_in_the_section_of_its_kind(answered: Evaluation, 
     verified = replace(ROW, name="Verified one", kind="verified", paper=None, note="Eight draws.")
     other = replace(answered, checking_seconds=88.5)
     training = Training("The data", "stackgen generate --config x.yaml", 1.5, "a machine")
-    plain, chosen = (result_of(row, some, question(), None, None) for row, some in ((ROW, answered), (verified, other)))
+    plain, chosen = (result_of(row, some, question()) for row, some in ((ROW, answered), (verified, other)))
     results = [replace(plain, remark="on other data"), chosen]
-    text = to_markdown(results, CONDITIONS, None, ["![a](a.png)"], [training])
+    report = Report(results, CONDITIONS, groundwork=[training])
+    text = to_markdown(report, ["![a](a.png)"])
     one_shot, _, rest = text.partition("## Verified")
     assert "| A method | CNN's |" in one_shot and "Verified one" not in one_shot
     assert "| Verified one | CNN's |" in rest and "Eight draws." in rest and "on other data" in rest
     assert "*85.20*" in one_shot and "take 1.5 minutes" in rest and training.command in rest
     assert "83.3 (66.7 to 100.0)" in one_shot  # stability: two scenes
-    write_csv(tmp_path / "table.csv", csv_rows(results))
+    write_csv(tmp_path / "table.csv", csv_rows(report))
     rows = list(csv.DictReader(io.StringIO((tmp_path / "table.csv").read_text())))
     assert [row["method"] for row in rows] == ["A method", "Verified one"]
     assert float(rows[0]["stability"]) == pytest.approx(83.3333) and rows[0]["stability_paper"] == "85.2"
     assert rows[1]["stability_paper"] == "" and rows[1]["number_of_scenes"] == "2"
-    first = json.loads(json.dumps(to_json(results, CONDITIONS, None, [training]), allow_nan=False))["rows"][0]
+    first = json.loads(json.dumps(to_json(report), allow_nan=False))["rows"][0]
     assert first["remark"] == "on other data" and set(first["paper_percent"]) == set(PAPER_COLUMNS)
     assert first["metrics"]["all"]["stability"]["value"] == pytest.approx(5 / 6)
 
 
 def test_a_chart_is_the_same_twice(answered: Evaluation, tmp_path: Path) -> None:
-    results = [result_of(ROW, answered, question(), None, None)]
+    results = [result_of(ROW, answered, question())]
     names = []
     for folder in (tmp_path / "a", tmp_path / "b"):
         names = draw_charts(results, folder)
