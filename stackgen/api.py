@@ -85,8 +85,8 @@ class Model:
 
         Args:
             silhouette: Image file or array, of any size and either polarity.
-            num_samples: How many stacks.
-            seed: Of the noise.
+            num_samples: Number of stacks.
+            seed: Seed of the samples.
             blocks: The block list; the network's most likely one by default.
             inventory: The blocks there are, in the same forms: the block list is then the most likely of
                 those they allow.

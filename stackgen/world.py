@@ -1,4 +1,4 @@
-"""The world that a stack lives in: shapes, the grid and its pictures, and how many blocks there may be.
+"""The world that a stack lives in: its shapes, the grid and the scale of its pictures, and the number of blocks.
 
 Units: cells (the edge of a cube) for lengths, pixels for pictures.
 """
@@ -35,7 +35,7 @@ class Shape:
     """A convex prism: an outline in the (x, z) plane extruded along y.
 
     Args:
-        name: Word used in block lists, files and tables.
+        name: Name in block lists, files and tables.
         outline: Corners (x, z) [cell] in the block frame, counter-clockwise seen from the front;
             the origin is the centre of the outline's box.
         depth: Extent along y [cell].
@@ -285,11 +285,11 @@ class Grid:
     were seen to do.
 
     Args:
-        width: Of the design grid [cell].
-        height: Of the design grid [cell].
+        width: Width of the design grid [cell].
+        height: Height of the design grid [cell].
         image_size: Edge of the silhouette [pixel].
-        pixels_per_cell: Scale.
-        ground_margin: Rows of pixels under the ground line.
+        pixels_per_cell: Scale of the pictures [pixel/cell].
+        ground_margin: Number of rows of pixels under the ground line.
 
     Raises:
         StackgenError: If a number is not positive (the margin: negative).
@@ -354,12 +354,12 @@ PAPER_GRID = Grid()
 
 @dataclass(frozen=True)
 class World:
-    """What every method is asked in: the shapes there are, the grid that pictures are drawn on, the longest block list.
+    """What a method must know of the questions it is asked: the shapes, the grid of the pictures, the longest block list.
 
     Args:
         catalogue: The shapes.
         grid: The design grid and the scale of its pictures.
-        max_blocks: Blocks of a stack, at most.
+        max_blocks: Largest number of blocks of a stack.
 
     Raises:
         StackgenError: If `max_blocks` is not a whole number of at least 1.

@@ -21,8 +21,8 @@ class Verb(NamedTuple):
     """A row of the table.
 
     Args:
-        module: With a `run(argv) -> int | None`.
-        help: One line.
+        module: Module with a function `run(verb, argv) -> int | None`.
+        help: Description of the verb in one line.
     """
 
     module: str
@@ -31,7 +31,7 @@ class Verb(NamedTuple):
 
 VERBS: dict[str, Verb] = {
     "sample": Verb("stackgen.commands.sample", "turn silhouettes into stacks that stand"),
-    "check": Verb("stackgen.commands.check", "judge the structures of a file: which stand, which fall"),
+    "check": Verb("stackgen.commands.check", "simulate the structures of a file: which stand, which fall"),
     "show": Verb("stackgen.commands.show", "draw the structures of a file, as a picture and in 3-D"),
     "capture": Verb("stackgen.commands.capture", "find the silhouette in a depth frame or a photo of a sketch"),
     "build": Verb("stackgen.commands.build", "build a structure with a UR5 and parallel jaws, simulated or real"),
@@ -53,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command line; never raises, so that every error has one form.
 
     Args:
-        argv: Without the program's name; those of the process by default.
+        argv: Arguments without the program's name; those of the process by default.
 
     Returns:
         The exit code: 0, what the verb answers (`check`: 1 if a stack falls), 2 for bad input,

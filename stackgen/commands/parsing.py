@@ -53,11 +53,11 @@ class Files:
     """The argument that a verb takes without its name.
 
     Args:
-        parameter: Of the verb's function.
-        metavar: What the help calls it.
-        help: What it is.
-        many: Any number of paths, at least one, instead of exactly one.
-        optional: One path or none.
+        parameter: Parameter of the verb's function.
+        metavar: Name of the argument in the help.
+        help: Description of the argument.
+        many: Whether it takes any number of paths, at least one, instead of exactly one.
+        optional: Whether it may be left out.
     """
 
     parameter: str
@@ -72,13 +72,13 @@ class Command:
     """A typed function as a verb: its parameters are the options, its docstring their help.
 
     Args:
-        verb: Its name.
-        function: What it does; answers the exit code, or None for 0.
-        example: Command lines to show under the help.
-        files: The paths it takes, if any.
+        verb: Name of the verb.
+        function: Function that is called; it returns the exit code, or None for 0.
+        example: Command lines that are shown under the help.
+        files: Paths that the verb takes, if any.
         settings: Parameters that are dataclasses, with their types; their fields are options of their own, without a
             prefix.
-        flags: Boolean parameters that are switched on by naming them, and their help.
+        flags: Boolean parameters that are switched on by naming them, with their help.
         hidden: Options whose parts (`cell` for `--cell.*`) only `--help=all` shows.
         interpolation: Whether `${...}` in configuration files stands for another option's value.
         config: Parameter that takes the text of all options as YAML, to be kept with what the verb makes.
@@ -172,10 +172,10 @@ def parse(parser: ArgumentParser, verb: str, argv: Sequence[str], own: ArgumentP
     """Parse, or say in one line what was wrong and where to look.
 
     Args:
-        parser: Of the arguments.
-        verb: Whose they are.
-        argv: The arguments.
-        own: The parser that knows the verb's options, if the other one only knows verbs.
+        parser: Parser of the arguments.
+        verb: Verb that the arguments belong to.
+        argv: Arguments of the command line.
+        own: Parser that knows the verb's options, if the other one only knows verbs.
 
     Raises:
         StackgenError: On an unknown option or key, a missing or ill-typed value, a broken YAML file.

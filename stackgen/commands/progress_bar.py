@@ -1,4 +1,4 @@
-"""The progress bar of long jobs, on stderr and for people alone."""
+"""The progress bar of long jobs, shown on stderr where that is a terminal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 class Advance(Protocol):
-    """Told how much is done, and of how much if that was not known before."""
+    """A function that is given how much is done, and the total if that was not known before."""
 
     def __call__(self, done: int, total: int | None = None) -> None:
         """Move the bar."""
@@ -24,8 +24,8 @@ def progress_bar(what: str, total: int | None = None) -> Iterator[tuple[Advance,
     """Show a bar until the block ends.
 
     Args:
-        what: Is being done.
-        total: Of how much; None as long as that is not known.
+        what: Name of what is counted.
+        total: Number of all of them; None as long as it is not known.
 
     Yields:
         A function that moves the bar, and one that prints a line above it; the line also comes out where there
