@@ -354,7 +354,7 @@ PAPER_GRID = Grid()
 
 @dataclass(frozen=True)
 class World:
-    """What a method must know of the questions it is asked: the shapes, the grid of the pictures, the longest block list.
+    """What a method must know of its questions: the shapes, the grid of the pictures, the longest block list.
 
     Args:
         catalogue: The shapes.

@@ -43,7 +43,7 @@ VERBS: dict[str, Verb] = {
     "predict": Verb("stackgen.commands.predict", "sample stacks for the scenes of a dataset"),
     "sweep": Verb("stackgen.commands.sweep", "try many settings of a training, locally or at W&B"),
     "prefer": Verb("stackgen.commands.prefer", "pair failures of a model with stacks that stand, to fine-tune it"),
-    "report": Verb("stackgen.commands.report", "make the paper's table with every row, and its charts"),
+    "report": Verb("stackgen.commands.report", "make the paper's table with every row, and its plots"),
     "export": Verb("stackgen.commands.export", "turn a training checkpoint into weights with a card"),
     "completion": Verb("stackgen.commands.completion", "print a script that completes this command line in a shell"),
 }

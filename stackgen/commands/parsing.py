@@ -36,6 +36,9 @@ HELP_OF_ALL = "--help=all"
 CONFIG_HELP = "YAML file with these options, or with a section named like the verb that holds them."
 
 
+_LITERAL = re.compile(r"(Optional\[)?Literal\[(.*?)\](?(1)\])")
+
+
 class HelpFormatter(DefaultHelpFormatter, argparse.RawDescriptionHelpFormatter):
     """Leaves the line breaks of the example under a help alone; names shapes and types as a person would."""
 
@@ -45,7 +48,10 @@ class HelpFormatter(DefaultHelpFormatter, argparse.RawDescriptionHelpFormatter):
         return super()._get_help_string(action)
 
     def _expand_help(self, action: argparse.Action) -> str:
-        return re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", super()._expand_help(action))
+        text = re.sub(r"<class '(?:\w+\.)*(\w+)'>", r"\1", super()._expand_help(action))
+        return _LITERAL.sub(
+            lambda found: found[2].replace("'", "").replace(", ", " | ") + (" | null" if found[1] else ""), text
+        )
 
 
 @dataclass(frozen=True)
