@@ -73,6 +73,6 @@ def test_block_lists_are_varied(samples: list[Sample]) -> None:
 
 
 def test_its_stacks_stand(samples: list[Sample]) -> None:
-    """Nearly all: the paper's recipe settles once. What `stackgen test` calls the ceiling is the exact share."""
+    """Nearly all: the paper's recipe settles once. What `stackgen test` calls the ground truth is the exact share."""
     verdicts = SimulatorChecker().check_all(sample.stack(PAPER_CATALOGUE) for sample in samples[::10])
     assert np.mean([verdict.stable for verdict in verdicts]) >= 0.96

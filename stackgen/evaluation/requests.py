@@ -14,6 +14,7 @@ import inspect
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from importlib.util import resolve_name
 from pathlib import Path
 from typing import Any
 
@@ -213,18 +214,19 @@ def code_hash(kind: type) -> str:
         name = names.pop()
         if name not in sources:
             sources[name] = Path(inspect.getfile(importlib.import_module(name))).read_bytes()
-            names += [found for found in _imports(sources[name]) if package and found.startswith(f"{package}.")]
+            found = _imports(sources[name], name.rpartition(".")[0])
+            names += [other for other in found if package and other.startswith(f"{package}.")]
     digest = hashlib.sha256()
     for name, source in sorted(sources.items()):
         digest.update(name.encode() + b"\0" + source)
     return digest.hexdigest()
 
 
-def _imports(source: bytes) -> Iterator[str]:
-    """Name the modules that a module imports by their full names."""
+def _imports(source: bytes, package: str) -> Iterator[str]:
+    """Name the modules that a module of a package imports, by their full names."""
     for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            yield node.module
+        if isinstance(node, ast.ImportFrom):
+            yield resolve_name("." * node.level + (node.module or ""), package)
         elif isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
 

@@ -55,14 +55,15 @@ def test_code_is_that_of_the_class_and_of_what_it_imports_beside_it(
     package.mkdir()
     (package / "__init__.py").touch()
     (package / "other.py").write_text("OTHER = 1\n")
-    (package / "part.py").write_text("PART = 1\n")
+    (package / "part.py").write_text("from .deep import DEEP\n\nPART = DEEP\n")
+    (package / "deep.py").write_text("DEEP = 1\n")
     (package / "a.py").write_text("from mine_code_hash.part import PART\n\nclass A:\n    part = PART\n")
     from mine_code_hash.a import A  # type: ignore[import-not-found]
 
     before = code_hash(A)
     (package / "other.py").write_text("OTHER = 2\n")
     assert code_hash(A) == before
-    (package / "part.py").write_text("PART = 2\n")
+    (package / "deep.py").write_text("DEEP = 2\n")
     assert code_hash(A) != before
     assert len({code_hash(kind) for kind in (BruteForce, GreedyRandom, RandomPlacement)}) == 3
 
