@@ -98,7 +98,7 @@ def main(wanted: Wanted, simulation: Simulation, real: RealArm, file: Path | Non
 
     placed = _check_options(wanted, simulation, real)
     content = _from_file(file, wanted) if wanted.from_image is None else _from_image(wanted.from_image, file, wanted)
-    physics = replace(Physics.of_world(content.physics), cell_size=content.cell_size)
+    physics = replace(Physics.recorded(content.physics), cell_size=content.cell_size)
     with progress_bar("plan", len(content.stacks[0])) as (advance, say):
         planned = first_buildable(
             content.stacks,
