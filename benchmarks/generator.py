@@ -95,7 +95,7 @@ def main() -> None:
 def made(settings: GenerateSettings, numbers: Sequence[int], what: str) -> tuple[list[list[Stack]], dict[str, float]]:
     """The stored stacks of each template, and what they cost in one process, the writing of the shard included."""
     families: list[list[Sample]] = []
-    with contextlib.closing(Counting(settings.physics, settings.catalogue)) as simulator:
+    with contextlib.closing(Counting(settings.physics)) as simulator:
         simulator.rollout(Stack(np.zeros(1, dtype=np.int64), np.array([[0, 0, 0.5, 0, 0, 0]])))  # opens the world
         opened = (simulator.rollouts, simulator.steps, simulator.seconds)
         begin = time.process_time()

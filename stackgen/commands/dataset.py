@@ -21,7 +21,7 @@ from stackgen.data.resplit import By, Resplit, resplit, split_table
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_json
 
-TRAVELS = 64 * 2**20
+EASY_TO_SEND = 64 * 2**20
 """Largest compact file that is easy to send along [byte]."""
 
 
@@ -165,7 +165,7 @@ def export(folder: Path, out: Path) -> None:
     splits = {name: dataset.split(name) for name in dataset.splits}
     save_npz(out, splits, dataset.manifest)
     size = out.stat().st_size
-    large = "" if size <= TRAVELS else f" (more than the {TRAVELS / 2**20:g} MiB that are easy to send along)"
+    large = "" if size <= EASY_TO_SEND else f" (more than the {EASY_TO_SEND / 2**20:g} MiB that are easy to send along)"
     print(f"wrote {out}: {sum(map(len, splits.values())):,} stacks, {size / 2**20:.1f} MiB{large}")
 
 

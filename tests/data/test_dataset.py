@@ -140,9 +140,15 @@ class _Asks(pl.LightningModule):
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_lightning_still_says_whether_a_batch_is_in_hand(dataset: Path) -> None:
     """The data module reads parts of Lightning's loop that are not documented, to resume exactly."""
-    module, quiet = _Asks(), {"enable_progress_bar": False, "enable_model_summary": False}
+    module = _Asks()
     trainer = pl.Trainer(
-        accelerator="cpu", max_steps=3, logger=False, enable_checkpointing=False, limit_val_batches=0, **quiet
+        accelerator="cpu",
+        max_steps=3,
+        limit_val_batches=0,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
     )
     trainer.fit(module, StackDataModule(dataset, 8))
     assert module.during == [True] * 3 and module.after == [False] * 3

@@ -193,7 +193,7 @@ def sample_margins(contents: Contents, checker: StabilityChecker, number: int, s
     """(number,) largest tilt of the ground [degrees] that some stacks survive, drawn without replacement."""
     size = min(number, len(contents.arrays))
     chosen = np.random.default_rng(seed).choice(len(contents.arrays), size, replace=False)
-    verdicts = [checker.check(contents.stack(i)) for i in chosen]
+    verdicts = checker.check_all([contents.stack(i) for i in chosen])
     return np.degrees([verdict.margin or 0.0 for verdict in verdicts])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 from contextlib import chdir
 from itertools import combinations
 from pathlib import Path
@@ -28,6 +29,7 @@ from stackgen.data.inspection.contents import (
 from stackgen.data.shards import Sample
 from stackgen.geometry import iou
 from stackgen.protocols import Verdict
+from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
 from tests.conftest import Cli
 
@@ -145,14 +147,19 @@ def test_nearness_counts_what_training_holds(contents: Contents, generated: Cont
 
 
 def test_margins_are_the_checker_s(contents: Contents) -> None:
-    class Judge:
+    class CountsBlocks:
+        physics = Physics()
+
         def check(self, stack: Stack) -> Verdict:
             """The margin is the number of blocks [degrees]."""
             return Verdict(True, np.zeros(0, bool), np.zeros(0), stack, True, np.radians(len(stack)))
 
-    margins = sample_margins(contents, Judge(), 101)
+        def check_all(self, stacks: Iterable[Stack]) -> list[Verdict]:
+            return [self.check(stack) for stack in stacks]
+
+    margins = sample_margins(contents, CountsBlocks(), 101)
     assert sorted(margins.round(6).tolist()) == sorted(contents.arrays.lengths.tolist())
-    assert len(sample_margins(contents, Judge(), 10, seed=1)) == 10
+    assert len(sample_margins(contents, CountsBlocks(), 10, seed=1)) == 10
     assert describe_margins(np.array([0.1, 0.7, 3, 9]))["share below 1 degrees"] == 0.5
 
 
