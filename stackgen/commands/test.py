@@ -11,7 +11,6 @@ from rich.console import Console
 from stackgen.commands.asking import arguments_of, load_both, open_run
 from stackgen.commands.parsing import Command
 from stackgen.commands.progress_bar import Advance, progress_bar
-from stackgen.data.provenance import warn_of_other_physics
 from stackgen.errors import StackgenError
 from stackgen.evaluation.parallel import simulating
 from stackgen.evaluation.protocol import BATCH, Request, evaluate, physics_of
@@ -20,6 +19,7 @@ from stackgen.evaluation.requests import Method, question_of
 from stackgen.evaluation.results import Evaluation, write_evaluation, write_metrics, write_scenes
 from stackgen.evaluation.tables import list_table, metrics_table
 from stackgen.io.provenance import code_version
+from stackgen.sim.other_physics import warn_of_other_physics
 from stackgen.training.runs import RUNS
 
 

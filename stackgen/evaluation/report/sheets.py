@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,22 +28,11 @@ EXAMPLES = 4
 """Successes on a sheet, and as many failures."""
 
 
-@dataclass(frozen=True)
-class Example:
-    """A sample of a scene.
-
-    Args:
-        scene: Results of the scene.
-        number: Number of the sample, from 0.
-    """
+class Example(NamedTuple):
+    """A sample of a scene, and its number, from 0."""
 
     scene: SceneResult
     number: int
-
-    @property
-    def front_iou(self) -> float:
-        """Front IoU of the structure that stood at the end."""
-        return self.scene.score.samples[self.number].front_iou
 
 
 def pick_examples(evaluation: Evaluation, number: int = EXAMPLES) -> tuple[list[Example], list[Example]]:
@@ -102,9 +91,9 @@ def draw_sheets(
 
 def _panel(example: Example, scenes: Mapping[str, Scene], checker: StabilityChecker, grid: Grid) -> Picture:
     """Draw target and sample, with what became of it."""
-    stack = example.scene.stacks[example.number]
-    target = scenes[example.scene.name].silhouette
-    return contact_sheet(target, [stack], [checker.check(stack)], [example.front_iou], grid=grid)
+    scene, number = example
+    stack, front_iou = scene.stacks[number], scene.score.samples[number].front_iou
+    return contact_sheet(scenes[scene.name].silhouette, [stack], [checker.check(stack)], [front_iou], grid=grid)
 
 
 def _sheet(successes: Sequence[Picture], failures: Sequence[Picture]) -> Picture:
