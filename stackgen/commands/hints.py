@@ -14,7 +14,9 @@ _OPTION = re.compile(
     r"unrecognized arguments: (?P<flag>--[^\s=]+)"
     r"|(Group '(?P<group>[\w.]+)' does not accept option|does not accept option|Option) '(?P<key>[\w.]+)'"
 )
-_NAME = re.compile(r"module '(?P<module>[\w.]+)' has no attribute '(?P<name>\w+)'")
+_NAME = re.compile(
+    r"(?:module '|No )(?P<module>[\w.]+)(?:' has no attribute '| attribute )(?P<name>\w+)"
+)  # lazy-loader's
 
 
 def did_you_mean(parser: ArgumentParser, message: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torchmetrics import MeanMetric
 
 from stackgen._lightning import pl
 from stackgen.data.arrays import Batch
@@ -266,10 +268,9 @@ class SampleQuality(pl.Callback):
         start = time.perf_counter()
         stacks = self._draw(sampler, scenes, trainer.global_rank)
         rate = len(scenes) * self.num_samples, time.perf_counter() - start
-        for name, (total, weight) in {**self._measure(sampler, scenes, stacks), "stacks_per_second": rate}.items():
-            # Weighted, so that the scenes of all processes count alike; NaN where no process has any weight.
-            mean = total / weight if weight else 0.0
-            pl_module.log(f"sample/{name}", mean, batch_size=float(weight), sync_dist=True)  # type: ignore[arg-type]
+        parts = {**self._measure(sampler, scenes, stacks), "stacks_per_second": rate}
+        means = {f"sample/{name}": _mean(part, pl_module.device) for name, part in parts.items()}
+        pl_module.log_dict(means, sync_dist=True)  # the same on all processes already
         if self.num_pictures and trainer.is_global_zero:
             firsts, shown = scenes[: self.num_pictures], [samples[0] for samples in stacks[: self.num_pictures]]
             verdicts = self.checker.check_all(shown) if self.checker else [None] * len(shown)
@@ -286,6 +287,14 @@ class SampleQuality(pl.Callback):
         names = SCENE_METRICS if self.checker else ("diversity", "front_iou_before_physics")
         parts = {name: np.sum([SCENE_METRICS[name](score) for score in scores], axis=0) for name in names}
         return {name: (float(total), float(weight)) for name, (total, weight) in parts.items()}
+
+
+def _mean(part: Part, device: torch.device) -> Tensor:
+    """The mean of a metric, all processes' scenes counting alike; NaN where it does not exist."""
+    total, weight = part
+    mean = MeanMetric(nan_strategy="ignore").to(device)
+    mean.update(total / weight if weight else math.nan, weight)
+    return mean.compute()
 
 
 class _NoPhysics(StabilityChecker):
