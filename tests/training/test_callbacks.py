@@ -280,9 +280,9 @@ def test_throughput_counts_the_samples_of_training(tmp_path: Path) -> None:
 def test_the_norm_is_that_of_all_gradients_before_they_are_clipped(tmp_path: Path) -> None:
     trainer = trainer_for(tmp_path, [StepMetrics(every_n_steps=1)], gradient_clip_val=0.1)
     trainer.fit(Module(), batches(3))
-    figures = trainer.callback_metrics
-    assert float(figures["train/gradient_norm"]) == pytest.approx(2**0.5)  # of a loss -(w1 + w2)
-    assert float(figures["train/learning_rate"]) == 1.0
+    metrics = trainer.callback_metrics
+    assert float(metrics["train/gradient_norm"]) == pytest.approx(2**0.5)  # of a loss -(w1 + w2)
+    assert float(metrics["train/learning_rate"]) == 1.0
     with pytest.raises(StackgenError, match="at least 1"):
         StepMetrics(0)
 
