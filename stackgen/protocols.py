@@ -26,8 +26,7 @@ class Verdict:
         drop: (k,) how far each block's centre sank [cell]; negative if it rose.
         settled: The blocks where they ended.
         at_rest: Whether everything stood still at the end of the watch.
-        margin: Largest tilt of the ground that the stack survives [rad], where an equilibrium
-            check gave one.
+        margin: Largest tilt of the ground that the stack survives [rad], where statics gave one.
     """
 
     stable: bool

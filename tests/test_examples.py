@@ -13,7 +13,7 @@ from stackgen.io.stacks_file import read_stacks
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.stack import Stack
 from stackgen.vision.drawings import read_silhouette
-from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE
+from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 WORD = {"c": "cube", "r": "rectangle", "l": "long_rectangle", "t": "triangle"}
@@ -54,15 +54,15 @@ def test_every_drawing_has_a_building() -> None:
 @pytest.mark.parametrize("name", BUILDINGS)
 def test_a_stack_that_stands_matches_the_drawing(name: str, checker: SimulatorChecker) -> None:
     stack = building(BUILDINGS[name])
-    target = read_silhouette(EXAMPLES / "silhouettes" / name)
+    target = read_silhouette(EXAMPLES / "silhouettes" / name, PAPER_GRID)
     verdict = checker.check(stack)
     assert len(stack) <= MAX_BLOCKS
-    assert silhouette_iou(stack, target) >= 0.95
+    assert silhouette_iou(stack, target, PAPER_GRID) >= 0.95
     assert verdict.stable
     assert verdict.at_rest
     assert np.abs(verdict.settled.poses[:, :3] - stack.poses[:, :3]).max() < 0.05
     assert tilt(verdict.settled.poses).max() < 0.02
-    assert silhouette_iou(verdict.settled, target) >= 0.95
+    assert silhouette_iou(verdict.settled, target, PAPER_GRID) >= 0.95
 
 
 def test_the_drawings_can_be_drawn_again(tmp_path: Path) -> None:
@@ -70,8 +70,8 @@ def test_the_drawings_can_be_drawn_again(tmp_path: Path) -> None:
     assert {drawing.file for drawing in script["DRAWINGS"]} == set(BUILDINGS)
     for drawing in script["DRAWINGS"]:
         script["save"](drawing, tmp_path)
-        again = read_silhouette(tmp_path / drawing.file)
-        assert (again == read_silhouette(EXAMPLES / "silhouettes" / drawing.file)).mean() > 0.999
+        again = read_silhouette(tmp_path / drawing.file, PAPER_GRID)
+        assert (again == read_silhouette(EXAMPLES / "silhouettes" / drawing.file, PAPER_GRID)).mean() > 0.999
 
 
 def test_the_stacks_do_what_their_comments_say(checker: SimulatorChecker) -> None:

@@ -44,7 +44,7 @@ def random_stack(seed: int, k: int = 6) -> Stack:
 
 def area(stack: Stack, view: View, grid: Grid = FINE) -> float:
     """Of a silhouette [cell^2]."""
-    return np.count_nonzero(silhouette(stack, view, grid)) / grid.pixels_per_cell**2
+    return np.count_nonzero(silhouette(stack, grid, view)) / grid.pixels_per_cell**2
 
 
 # Areas: a digital picture of a convex outline errs by less than its perimeter times a pixel.
@@ -90,7 +90,7 @@ def test_turning_in_the_picture_keeps_the_area(angle: float) -> None:
 @pytest.mark.parametrize("view", VIEWS)
 def test_a_pixel_is_set_when_its_centre_is_covered(view: View) -> None:
     x, y, z = 0.31, -0.22, 1.77
-    picture = silhouette(one(1, x, y, z), view)
+    picture = silhouette(one(1, x, y, z), PAPER_GRID, view)
     right, up = np.meshgrid(PAPER_GRID.horizontal(), PAPER_GRID.vertical(view))
     across = {"front": (x, 2, z, 1), "side": (y, 1, z, 1), "top": (x, 2, y, 1)}[view]
     covered = (np.abs(right - across[0]) <= across[1] / 2) & (np.abs(up - across[2]) <= across[3] / 2)
@@ -98,7 +98,7 @@ def test_a_pixel_is_set_when_its_centre_is_covered(view: View) -> None:
 
 
 def test_the_ground_line_and_the_scale_are_the_grid_s() -> None:
-    picture = silhouette(one(0))
+    picture = silhouette(one(0), PAPER_GRID)
     rows, columns = np.nonzero(picture)
     assert (rows.min(), rows.max()) == (64 - 4 - 14, 64 - 4 - 1)
     assert (columns.min(), columns.max()) == (32 - 7, 32 + 7 - 1)
@@ -111,20 +111,22 @@ def test_the_ground_line_and_the_scale_are_the_grid_s() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_stack_shows_the_union_of_its_blocks(view: View, seed: int) -> None:
     stack = random_stack(seed)
-    blocks = [silhouette(Stack(stack.shapes[i : i + 1], stack.poses[i : i + 1]), view) for i in range(len(stack))]
-    assert (silhouette(stack, view) == np.any(blocks, axis=0)).all()
-    assert not silhouette(Stack([], np.zeros((0, 6))), view).any()  # type: ignore[arg-type]
+    blocks = [
+        silhouette(Stack(stack.shapes[i : i + 1], stack.poses[i : i + 1]), PAPER_GRID, view) for i in range(len(stack))
+    ]
+    assert (silhouette(stack, PAPER_GRID, view) == np.any(blocks, axis=0)).all()
+    assert not silhouette(Stack([], np.zeros((0, 6))), PAPER_GRID, view).any()  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("view", VIEWS)
 def test_margins_add_what_lies_outside_and_change_nothing_inside(view: View) -> None:
     stack = random_stack(7)
-    wide = silhouette(stack, view, margin=40)
+    wide = silhouette(stack, PAPER_GRID, view, 40)
     assert wide.shape == (144, 144)
-    assert (wide[40:-40, 40:-40] == silhouette(stack, view)).all()
+    assert (wide[40:-40, 40:-40] == silhouette(stack, PAPER_GRID, view)).all()
     away = one(0, x=3.5, y=3.5, z=0.5)
-    assert not silhouette(away, view).any()
-    assert np.count_nonzero(silhouette(away, view, margin=40)) == 14 * 14
+    assert not silhouette(away, PAPER_GRID, view).any()
+    assert np.count_nonzero(silhouette(away, PAPER_GRID, view, 40)) == 14 * 14
 
 
 @pytest.mark.parametrize(("x", "z"), [(-1.78, 0.5), (1.78, 0.5), (0, 3.77), (1.78, 3.77)])
@@ -132,16 +134,16 @@ def test_nothing_of_a_legal_stack_is_cut_off(x: float, z: float) -> None:
     """0.28 cells beyond the 4 x 4 grid are still on the canvas."""
     for view in VIEWS:
         stack = one(0, x, x, z)
-        assert (silhouette(stack, view, margin=20) == np.pad(silhouette(stack, view), 20)).all()
+        assert (silhouette(stack, PAPER_GRID, view, 20) == np.pad(silhouette(stack, PAPER_GRID, view), 20)).all()
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_mirrored_stack_has_the_mirrored_silhouette(seed: int) -> None:
     stack = random_stack(seed)
     there = mirror(stack)
-    assert (silhouette(there, "front") == np.fliplr(silhouette(stack, "front"))).all()
-    assert (silhouette(there, "top") == np.fliplr(silhouette(stack, "top"))).all()
-    assert (silhouette(there, "side") == silhouette(stack, "side")).all()
+    assert (silhouette(there, PAPER_GRID, "front") == np.fliplr(silhouette(stack, PAPER_GRID, "front"))).all()
+    assert (silhouette(there, PAPER_GRID, "top") == np.fliplr(silhouette(stack, PAPER_GRID, "top"))).all()
+    assert (silhouette(there, PAPER_GRID, "side") == silhouette(stack, PAPER_GRID, "side")).all()
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -223,9 +225,9 @@ def test_iou_is_symmetric_between_0_and_1_and_1_for_equals_alone(a: NDArray[np.b
 @pytest.mark.parametrize("shift", [0, 1, 5, 13, 14, 20])
 def test_iou_of_a_shifted_block(shift: int) -> None:
     """Two squares that share a part 1 - s of their width: (1 - s) / (1 + s)."""
-    target = silhouette(one(0))
+    target = silhouette(one(0), PAPER_GRID)
     share = max(0, 1 - shift / 14)
-    assert silhouette_iou(one(0, x=shift / 14), target) == pytest.approx(share / (2 - share))
+    assert silhouette_iou(one(0, x=shift / 14), target, PAPER_GRID) == pytest.approx(share / (2 - share))
 
 
 @pytest.mark.parametrize("view", VIEWS)
@@ -239,19 +241,19 @@ def test_a_block_that_left_the_canvas_counts_as_outside_the_target(
 ) -> None:
     """Wherever it went and however it lies, it is as if it lay beside the target, whole."""
     rotation = (0.0, np.pi / 2, 0.0) if turned else (0.0, 0.0, 0.0)
-    target = silhouette(one(0), view)
+    target = silhouette(one(0), PAPER_GRID, view)
     both = Stack(np.array([0, 2]), np.array([[0, 0, 0.5, 0, 0, 0], [*place, *rotation]]))
     if view == "side" and abs(place[1]) < 1:
         pytest.skip("not off the canvas in this view")
-    alone = np.count_nonzero(silhouette(one(2, z=2, rotation=rotation), view, margin=64))
-    assert silhouette_iou(both, target, view) == pytest.approx(14 * 14 / (14 * 14 + alone), rel=0.04)
+    alone = np.count_nonzero(silhouette(one(2, z=2, rotation=rotation), PAPER_GRID, view, 64))
+    assert silhouette_iou(both, target, PAPER_GRID, view) == pytest.approx(14 * 14 / (14 * 14 + alone), rel=0.04)
 
 
 def test_a_block_high_above_the_canvas_does_not_reach_into_it() -> None:
     tower = Stack(np.zeros(4, int), np.array([[0, 0, z + 0.5, 0, 0, 0] for z in range(4)]))
     above = [0, 0, 30, 0, np.pi / 2, 0]  # a long rectangle on end
     both = Stack(np.append(tower.shapes, 2), np.vstack([tower.poses, above]))
-    assert silhouette_iou(both, silhouette(tower)) == pytest.approx(4 / 7, rel=0.02)
+    assert silhouette_iou(both, silhouette(tower, PAPER_GRID), PAPER_GRID) == pytest.approx(4 / 7, rel=0.02)
 
 
 def test_iou_with_the_own_silhouette_is_1() -> None:
@@ -261,4 +263,4 @@ def test_iou_with_the_own_silhouette_is_1() -> None:
         poses[:, 0], poses[:, 2] = rng.uniform(-0.5, 0.5, 4), np.arange(4) * 0.9 + 0.7
         stack = Stack(np.array([0, 1, 3, 0]), poses)
         for view in VIEWS:
-            assert silhouette_iou(stack, silhouette(stack, view), view) == 1
+            assert silhouette_iou(stack, silhouette(stack, PAPER_GRID, view), PAPER_GRID, view) == 1

@@ -202,14 +202,14 @@ def test_a_stack_counts_its_blocks(shapes: list[int]) -> None:
 
 @given(block_lists)
 def test_a_block_list_survives_its_text(counts: list[int]) -> None:
-    assert parse_block_list(format_block_list(counts)).tolist() == counts
+    assert parse_block_list(format_block_list(counts, PAPER_CATALOGUE), PAPER_CATALOGUE, MAX_BLOCKS).tolist() == counts
 
 
 @given(block_lists, st.randoms(use_true_random=False))
 def test_order_spaces_and_repetition_do_not_matter(counts: list[int], random: Any) -> None:
     parts = [f" {name} = 1 " for name, n in zip(PAPER_CATALOGUE.names, counts, strict=True) for _ in range(n)]
     random.shuffle(parts)
-    assert parse_block_list(",".join(parts)).tolist() == counts
+    assert parse_block_list(",".join(parts), PAPER_CATALOGUE, MAX_BLOCKS).tolist() == counts
 
 
 @given(block_lists)
@@ -242,22 +242,22 @@ def test_a_block_list_is_the_counts_of_its_shapes(counts: list[int]) -> None:
 )
 def test_a_wrong_block_list_is_one_line(text: str, message: str) -> None:
     with pytest.raises(StackgenError, match=message) as caught:
-        parse_block_list(text)
+        parse_block_list(text, PAPER_CATALOGUE, MAX_BLOCKS)
     assert "\n" not in str(caught.value)
 
 
 @given(st.text(alphabet="cube=3,rectangl_ -\n9", max_size=30))
 def test_any_text_is_a_block_list_or_one_line(text: str) -> None:
     try:
-        counts = parse_block_list(text)
+        counts = parse_block_list(text, PAPER_CATALOGUE, MAX_BLOCKS)
     except StackgenError as error:
         answer = str(error)
     else:
-        answer = format_block_list(counts)
+        answer = format_block_list(counts, PAPER_CATALOGUE)
         assert 1 <= counts.sum() <= MAX_BLOCKS and counts.min() >= 0
     assert answer and "\n" not in answer
 
 
 def test_negative_counts_are_refused_even_if_the_sum_is_right() -> None:
     with pytest.raises(StackgenError, match="at least 0"):
-        check_block_list([3, -1, 0, 0])
+        check_block_list([3, -1, 0, 0], MAX_BLOCKS)

@@ -14,7 +14,7 @@ from rich.progress import Progress
 
 from stackgen.api import DEFAULT, load
 from stackgen.commands.parsing import Command, Files
-from stackgen.commands.tables import add_entries, verdict_table
+from stackgen.commands.verdict_table import verdict_table
 from stackgen.errors import StackgenError
 from stackgen.io.files import require_folder, staged
 from stackgen.io.stacks_file import StacksFile, write_stacks
@@ -95,10 +95,8 @@ def main(
 
 def report(results: Sequence[StacksFile], out: Path, verified: bool) -> int:
     """Print what became of the images; the exit code is 1 if a stack falls that was said to be verified."""
-    table, console = verdict_table("image"), Console()
-    for result in results:
-        add_entries(table, result.silhouette or "", result.entries, most=1)
-    console.print(table)
+    console = Console()
+    console.print(verdict_table("image", [(result.silhouette or "", result.entries) for result in results], most=1))
     falls = False
     for result in results if verified else ():
         console.print(f"{result.silhouette}: {result.comment}", highlight=False)

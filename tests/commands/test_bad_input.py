@@ -72,9 +72,9 @@ def test_missing_and_ill_typed_values_are_named(arguments: list[str], word: str,
         ("generate", "name: x\nstacks: 10\nphysics: {frcition: 0.5}\n", "frcition"),
         ("generate", "name: [x\n", "config"),
         ("fit", "trainer: {max_epoch: 3}\n", "max_epoch"),
-        ("fit", "model: {class_path: stackgen.models.diffusion.module.DDPM, init_args: {layers: 3}}\n", "layers"),
-        ("fit", "model: {class_path: stackgen.models.diffusion.module.DDMP}\n", "DDMP"),
-        ("fit", "model: {class_path: stackgen.models.diffusion.module.DDPM}\ndata: {path: x, sise: 3}\n", "sise"),
+        ("fit", "model: {class_path: stackgen.models.DDPM, init_args: {layers: 3}}\n", "layers"),
+        ("fit", "model: {class_path: stackgen.models.DDMP}\n", "DDMP"),
+        ("fit", "model: {class_path: stackgen.models.DDPM}\ndata: {path: x, sise: 3}\n", "sise"),
     ],
 )
 def test_a_wrong_key_of_a_config_file_is_named(verb: str, text: str, word: str, cli: Cli, tmp_path: Path) -> None:
@@ -203,7 +203,7 @@ def test_a_missing_or_foreign_checkpoint_is_named(
     before = files_below(tmp_path)
     assert_one_line(cli("sample", tower_image, "--weights", path, "--out", tmp_path / "out"), "bad.ckpt")
     assert_one_line(cli("export", path, "--out", tmp_path / "x.safetensors"), "bad.ckpt")
-    fit = ["fit", "--model", "stackgen.models.diffusion.module.DDPM", "--data.path", "x"]
+    fit = ["fit", "--model", "stackgen.models.DDPM", "--data.path", "x"]
     assert_one_line(cli(*fit, "--ckpt_path", path), "bad.ckpt")
     assert_one_line(cli("test", "--ckpt_path", path), "bad.ckpt")
     assert files_below(tmp_path) == before
@@ -223,7 +223,7 @@ def test_weights_of_the_other_network_are_refused(
 
 def test_a_run_without_checkpoint_is_named(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    fit = ["fit", "--model", "stackgen.models.diffusion.module.DDPM", "--data.path", "x", "--name", "new"]
+    fit = ["fit", "--model", "stackgen.models.DDPM", "--data.path", "x", "--name", "new"]
     assert_one_line(cli(*fit, "--ckpt_path", "last"), "runs/new")
     assert_one_line(cli(*fit), "no dataset at x")
     assert files_below(tmp_path) == []

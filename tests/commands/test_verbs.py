@@ -76,8 +76,8 @@ def test_a_misspelt_option_of_any_verb_is_answered_with_the_nearest(verb: tuple[
         ("data: {batchsize: 3}", "data.batch_size"),
         ("model: {init_args: {denoiser: {widht: 3}}}", "denoiser.width"),
         ("model: {init_args: {drawz: 3}}", "draws"),
-        ("model: {class_path: stackgen.models.diffusion.module.DDMP}", "DDPM"),
-        ("trainer: {callbacks: [{class_path: stackgen.training.callbacks.EMA, init_args: {decya: 0.9}}]}", "decay"),
+        ("model: {class_path: stackgen.models.DDMP}", "DDPM"),
+        ("trainer: {callbacks: [{class_path: stackgen.training.EMA, init_args: {decya: 0.9}}]}", "decay"),
     ],
 )
 def test_a_misspelt_key_of_a_file_is_answered_with_the_nearest(
