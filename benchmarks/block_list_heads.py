@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from benchmarks.common import argument_parser, plain_table, report, start
 
@@ -43,7 +43,7 @@ def main() -> None:
     report("block_list_heads", {**metrics, "rows": rows}, [plain_table(title, headings, cells)], options.out)
 
 
-def measure(options: argparse.Namespace, head: str) -> dict[str, Any]:
+def measure(options: argparse.Namespace, head: Literal["classes", "chain"]) -> dict[str, Any]:
     """Train a network with one head, and ask it."""
     import numpy as np
     import torch

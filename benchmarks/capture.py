@@ -52,9 +52,7 @@ def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
     options.add_argument("--number", type=int, default=100, help="number of stacks")
-    options.add_argument(
-        "--seed", type=int, default=0, help="seed of the draw, the cameras, their noise and samples"
-    )
+    options.add_argument("--seed", type=int, default=0, help="seed of the draw, the cameras, their noise and samples")
     return options
 
 
@@ -81,7 +79,7 @@ def case(stack: Stack, rng: np.random.Generator, model: Model) -> Case:
     distance, elevation, azimuth = rng.uniform([0.55, 0, -15], [0.9, 25, 15])
     rig = Rig(float(distance), float(elevation), float(azimuth))
     seed = int(rng.integers(2**31))
-    found = find_structure(simulated_frame(stack, rig, seed=seed))
+    found = find_structure(simulated_frame(stack, rig, seed=seed), PAPER_GRID)
     own = own_silhouette(stack)
     silhouettes = (found.as_seen, found.silhouette)
     best = [model.sample_verified(mask, 1, seed).entries[0] for mask in silhouettes]

@@ -98,8 +98,8 @@ def test_every_checker_says_of_many_stacks_what_it_says_of_each(make: Callable[[
     physics = Physics(friction=0.4)
     checker = make(physics)
     assert checker.physics == physics
-    stands = Stack([0, 0], [[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]])
-    falls = Stack([0, 0], [[0, 0, 0.5, 0, 0, 0], [0.9, 0, 1.5, 0, 0, 0]])
+    stands = Stack(np.array([0, 0]), np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]]))
+    falls = stands.with_poses([[0, 0, 0.5, 0, 0, 0], [0.9, 0, 1.5, 0, 0, 0]])
     verdicts = checker.check_all(iter([stands, falls, stands]))
     assert [verdict.stable for verdict in verdicts] == [True, False, True]
     for stack, verdict in zip((stands, falls), verdicts, strict=False):
@@ -108,9 +108,12 @@ def test_every_checker_says_of_many_stacks_what_it_says_of_each(make: Callable[[
 
 
 def test_one_simulator_takes_stacks_of_several_catalogues() -> None:
-    tower = [[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]]
+    tower = np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]])
     slabs = Catalogue((Shape.box("slab", 2, 0.5), Shape.box("cube", 1)))
-    stacks = [Stack([0, 0], tower), Stack([0, 1], [[0, 0, 0.25, 0, 0, 0], [0.4, 0, 1.0, 0, 0, 0]], slabs)]
+    stacks = [
+        Stack(np.array([0, 0]), tower),
+        Stack(np.array([0, 1]), np.array([[0, 0, 0.25, 0, 0, 0], [0.4, 0, 1.0, 0, 0, 0]]), slabs),
+    ]
     together = SimulatorChecker().check_all(stacks + stacks)
     for stack, first, again in zip(stacks, together[:2], together[2:], strict=True):
         alone = SimulatorChecker().check(stack)

@@ -25,7 +25,7 @@ def test_a_filled_face_has_its_area_and_neighbours_share_no_pixel() -> None:
 
 def test_borders_are_the_pixels_on_both_sides_of_a_step() -> None:
     values = np.zeros((6, 7))
-    values[2:4, 3:] = [[0.5, 0.5, 0.5, 0.5], [2, 2, 2, 2]]
+    values[2, 3:], values[3, 3:] = 0.5, 2.0
     rows, columns = np.nonzero(borders(values, 1.0))
     assert sorted(set(zip(rows.tolist(), columns.tolist(), strict=True))) == sorted(
         {(3, 2), *((row, column) for row in (2, 3, 4) for column in range(3, 7))}
