@@ -66,7 +66,6 @@ def execute(
     on_start: Callable[[BlockPlan], None] = _ignore,
     on_release: Callable[[BlockPlan], None] = _ignore,
     on_done: Callable[[BlockPlan], None] = _ignore,
-    first: int = 0,
 ) -> None:
     """Have an arm carry out a plan.
 
@@ -74,12 +73,11 @@ def execute(
         plan: Plan from :func:`stackgen.robot.planning.plan.plan_build`.
         arm: Arm at the place where the first motion starts.
         on_start, on_release, on_done: Called before each block, when the jaws have let it go, and after it.
-        first: Number of the step to begin with.
 
     Raises:
         StackgenError: If the arm stops on its own.
     """
-    for step in plan.blocks[first:]:
+    for step in plan.blocks:
         on_start(step)
         last_open = max(i for i, action in enumerate(step.actions) if isinstance(action, Open))
         for number, action in enumerate(step.actions):

@@ -29,6 +29,7 @@ from stackgen.robot.simulated.window import Window
 from stackgen.robot.workcell import Grasp, Workcell
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
+from stackgen.sim.statics.checker import StaticsChecker
 from stackgen.stack import Stack
 from stackgen.world import Grid, Mask
 
@@ -86,7 +87,7 @@ def design(generated: Stack, workcell: Workcell, physics: Physics, strategy: Str
     roomy = make_room(verdict.settled, workcell.workspace.gap / physics.cell_size)
     stack = roomy if _verdict(roomy, physics).stable else verdict.settled
     jaws = TopDownJaws(workcell.jaws, physics.cell_size, workcell.workspace.clearance)
-    order = plan_order(stack, approach=jaws, strategy=strategy)
+    order = plan_order(stack, checker=StaticsChecker(physics), approach=jaws, strategy=strategy)
     if not order.safe and strategy != "greedy":
         raise StackgenError(f"no order is safe: {order.blocked}; --order greedy builds it in the paper's order")
     return Design(stack, verdict.settled, order, strategy)

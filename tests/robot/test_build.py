@@ -150,10 +150,9 @@ def test_an_arm_that_stops_is_not_moved_on(gate: BuildPlan) -> None:
     assert len(arm.done) == 14
 
 
-def test_a_build_goes_on_with_a_later_block(gate: BuildPlan) -> None:
-    arm = _Recorder()
-    execute(gate, arm, first=2)
-    assert arm.done.count("lift") == 1
+def test_an_order_s_margins_are_those_of_the_build_s_friction() -> None:
+    margins = [design(CUBE, PLAIN, replace(PHYSICS, friction=friction)).order.least_margin for friction in (0.3, 0.5)]
+    assert margins == pytest.approx(np.degrees(np.arctan([0.3, 0.5])), abs=0.1)
 
 
 def test_noise_is_the_same_for_the_same_seed() -> None:

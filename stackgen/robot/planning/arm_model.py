@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stackgen.errors import require
-from stackgen.robot.planning.urdf import chain_urdf
+from stackgen.robot.planning.urdf import chain_urdf, unusable
 from stackgen.robot.workcell import ArmDescription
 
 Floats = NDArray[np.float64]
@@ -23,13 +23,17 @@ class ArmModel:
         arm: Its description.
 
     Raises:
-        StackgenError: If Pinocchio is not installed, or the description has no such chain.
+        StackgenError: If Pinocchio is not installed, or cannot read the description, or that has no such chain.
     """
 
     def __init__(self, arm: ArmDescription) -> None:
         self.pinocchio: Any = require("pinocchio", "robot")
         self.description = arm
-        self.model = self.pinocchio.buildModelFromXML(ElementTree.tostring(chain_urdf(arm), encoding="unicode"))
+        text = ElementTree.tostring(chain_urdf(arm), encoding="unicode")
+        try:
+            self.model = self.pinocchio.buildModelFromXML(text)
+        except (ValueError, RuntimeError) as error:
+            raise unusable(arm, error) from error
         self.data = self.model.createData()
         self.flange = self.model.getFrameId(arm.flange)
         self.names = tuple(self.model.names)[1:]

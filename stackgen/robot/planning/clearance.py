@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from stackgen.robot.planning.connection import Connected
-from stackgen.robot.planning.urdf import FINGER_JOINTS, FINGERS, chain_links, self_collision_pairs, with_jaws
+from stackgen.robot.planning.urdf import FINGER_JOINTS, FINGERS, chain_links, self_collision_pairs, unusable, with_jaws
 from stackgen.robot.workcell import Workcell
 from stackgen.sim.physics import Physics
 from stackgen.sim.simulator import Mold, bullet
@@ -66,15 +66,26 @@ def body_placement(shape: Shape, frame: Floats, cell_size: float) -> tuple[list[
     return position.tolist(), Rotation.from_matrix(frame[:3, :3]).as_quat().tolist()
 
 
+def block_corners(stack: Stack, block: int, frame: Floats, cell_size: float) -> Floats:
+    """Corners (V, 3) [m] of a block at a frame (4, 4)."""
+    return stack.catalogue[int(stack.shapes[block])].vertices * cell_size @ frame[:3, :3].T + frame[:3, 3]
+
+
 def load_arm(workcell: Workcell, client: int, visual: bool) -> int:
-    """Load the arm with its jaws at its place; return Bullet's number of its body."""
+    """Load the arm with its jaws at its place; return Bullet's number of its body.
+
+    Raises:
+        StackgenError: If Bullet cannot read the description.
+    """
     with tempfile.TemporaryDirectory(prefix="stackgen-") as folder:
         file = Path(folder) / "arm_with_jaws.urdf"
         file.write_text(with_jaws(workcell.arm, workcell.jaws, visual))
         yaw = Rotation.from_matrix(workcell.base.table_from_base[:3, :3]).as_quat().tolist()
-        return int(
-            bullet.loadURDF(str(file), list(workcell.base.position), yaw, useFixedBase=True, physicsClientId=client)
-        )
+        place = list(workcell.base.position), yaw
+        try:
+            return int(bullet.loadURDF(str(file), *place, useFixedBase=True, physicsClientId=client))
+        except bullet.error as error:
+            raise unusable(workcell.arm, error) from error
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.robot.planning.arm_model import arm_model
-from stackgen.robot.planning.clearance import TABLE, Clearances, Near, block_frame
+from stackgen.robot.planning.clearance import TABLE, Clearances, Near, block_corners, block_frame
 from stackgen.robot.planning.kinematics import SOLVERS, InverseKinematics, SolverName, Unreachable
 from stackgen.robot.planning.motion import Action, Close, Motion, Open, joint_motion, line_motion
 from stackgen.robot.planning.staging import Waiting, lay_out, push_path
@@ -219,9 +219,7 @@ class _Planner:
         """Height of the finger tips at which what they hold passes over everything else by the workspace's lift."""
         hangs = 0.0
         if self.handled is not None and self.held == self.handled:
-            shape = self.scene.stack.catalogue[int(self.scene.stack.shapes[self.handled])]
-            frame = tip @ self.held_in_tip
-            corners = shape.vertices * self.cell_size @ frame[:3, :3].T + frame[:3, 3]
+            corners = block_corners(self.scene.stack, self.handled, tip @ self.held_in_tip, self.cell_size)
             hangs = float(tip[2, 3] - corners[:, 2].min())
         others = [top for number, top in self.heights.items() if number != self.held]
         return max(others, default=0.0) + hangs + self.workcell.workspace.lift
@@ -322,9 +320,7 @@ class _Planner:
     def put_down(self, block: int, goal: Floats) -> None:
         """Note that a block is at its place."""
         self.scene.put_block(block, goal)
-        shape = self.scene.stack.catalogue[int(self.scene.stack.shapes[block])]
-        corners = shape.vertices * self.cell_size @ goal[:3, :3].T + goal[:3, 3]
-        self.heights[block] = float(corners[:, 2].max())
+        self.heights[block] = float(block_corners(self.scene.stack, block, goal, self.cell_size)[:, 2].max())
 
 
 def _moved(tip: Floats, up: float) -> Floats:

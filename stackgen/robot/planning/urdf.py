@@ -47,17 +47,14 @@ def chain_urdf(arm: ArmDescription) -> Element:
     Joints without limits turn by two turns; meshes get their full paths.
 
     Raises:
-        StackgenError: If there is no such chain, or a joint of it does not turn.
+        StackgenError: If there is no such chain, a joint of it does not turn, or a mesh is missing.
     """
     file = arm_file(arm.urdf)
-    try:
-        root = ElementTree.parse(file).getroot()
-    except ElementTree.ParseError as error:
-        raise StackgenError(f"{file}: is no URDF: {error}") from error
+    root = _parsed(file, "URDF")
     above = {_named(joint, "child", "link"): joint for joint in root.iter("joint") if joint.find("child") is not None}
     joints, links = [], [arm.flange]
     while links[-1] != arm.base:
-        joint = above.get(links[-1])
+        joint = above.pop(links[-1], None)  # so that a circle ends, too
         if joint is None:
             raise StackgenError(
                 f"{file}: no chain leads from {arm.base} to {arm.flange} (cell.arm.base, cell.arm.flange)"
@@ -69,13 +66,16 @@ def chain_urdf(arm: ArmDescription) -> Element:
         raise StackgenError(
             f"{file}: the joints from {arm.base} to {arm.flange} must be revolute, got {sorted(map(str, kinds))}"
         )
+    missing = set(links) - {link.get("name", "") for link in root.iter("link")}
+    if missing:
+        raise StackgenError(f"{file}: the chain has no link {', '.join(sorted(missing))}")
     for part in list(root):
         if part.tag != "material" and part not in joints and not (part.tag == "link" and part.get("name") in links):
             root.remove(part)
     for joint in joints:
-        if joint.get("type") == "continuous":
+        limit = joint.find("limit")
+        if joint.get("type") == "continuous" or (joint.get("type") == "revolute" and limit is None):
             joint.set("type", "revolute")
-            limit = joint.find("limit")
             limit = SubElement(joint, "limit", effort="100", velocity="3") if limit is None else limit
             limit.set("lower", f"{-2 * math.pi}")
             limit.set("upper", f"{2 * math.pi}")
@@ -84,10 +84,28 @@ def chain_urdf(arm: ArmDescription) -> Element:
     return root
 
 
+def _parsed(file: Path, what: str) -> Element:
+    try:
+        return ElementTree.parse(file).getroot()
+    except ElementTree.ParseError as error:
+        raise StackgenError(f"{file}: is no {what}: {error}") from error
+
+
 def _mesh_file(name: str, urdf: Path) -> Path:
-    """A mesh beside its URDF, or in a ROS package that one of the URDF's folders is or holds."""
+    """Find a mesh of the package, beside its URDF, or in a ROS package that one of the URDF's folders is or holds."""
+    if name.startswith(f"package://{_PACKAGE}/"):
+        return arm_file(name)
     relative = name.removeprefix("package://").removeprefix("file://")
-    return next((folder / relative for folder in urdf.parents if (folder / relative).exists()), Path(relative))
+    for folder in urdf.absolute().parents:
+        if (folder / relative).is_file():
+            return folder / relative
+    raise StackgenError(f"{urdf}: the mesh {name} is not there; put its package beside the URDF or above it")
+
+
+def unusable(arm: ArmDescription, error: Exception) -> StackgenError:
+    """Make the line about a chain that a reader of URDFs refuses."""
+    reason = " ".join(str(error).split())
+    return StackgenError(f"{arm_file(arm.urdf)}: the chain from {arm.base} to {arm.flange} cannot be read: {reason}")
 
 
 def chain_links(arm: ArmDescription) -> tuple[str, ...]:
@@ -115,7 +133,7 @@ def self_collision_pairs(arm: ArmDescription) -> list[tuple[str, str]]:
     links = chain_links(arm)
     harmless = {frozenset(pair) for pair in pairwise(links)}
     if arm.srdf:
-        named = ElementTree.parse(arm_file(arm.srdf)).getroot().iter("disable_collisions")
+        named = _parsed(arm_file(arm.srdf), "SRDF").iter("disable_collisions")
         harmless |= {frozenset((pair.get("link1", ""), pair.get("link2", ""))) for pair in named}
     tool = [(link, part) for link in links[:4] for part in (PALM, *FINGERS)]
     return [pair for pair in combinations(links, 2) if frozenset(pair) not in harmless] + tool

@@ -20,7 +20,7 @@ from stackgen.errors import StackgenError
 
 PORT = 63352
 POSITIONS = 255
-ACTIVE, MOVING, STOPPED_OPENING, HOLDS, ARRIVED = 3, 0, 1, 2, 3  # of STA the first, of OBJ the others
+ACTIVE, MOVING, STOPPED_OPENING, HOLDS = 3, 0, 1, 2  # of STA the first, of OBJ the others
 
 _LOOK = 0.02  # between looks at jaws that move [s]
 _PATIENCE = 5.0  # with an answer, and with jaws that do not stop [s]

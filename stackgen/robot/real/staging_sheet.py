@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull
 
 from stackgen.errors import StackgenError, require
 from stackgen.io.files import write_atomically
+from stackgen.robot.planning.clearance import block_corners
 from stackgen.robot.planning.staging import Waiting, lay_out
 from stackgen.robot.workcell import Workcell, pose
 from stackgen.stack import Stack
@@ -73,8 +74,7 @@ def places(stack: Stack, order: tuple[int, ...], workcell: Workcell, cell_size: 
 def _drawing(
     number: int, waiting: Waiting, block: int, stack: Stack, *, workcell: Workcell, cell_size: float
 ) -> SlotDrawing:
-    shape = stack.catalogue[int(stack.shapes[block])]
-    corners = shape.vertices * cell_size @ waiting.frame[:3, :3].T + waiting.frame[:3, 3]
+    corners = block_corners(stack, block, waiting.frame, cell_size)
     x, y, turn = workcell.staging.slots[number - 1]
     slot = pose((x, y, 0.0), turn)
     half = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [workcell.staging.length / 2, workcell.staging.depth / 2]
@@ -83,7 +83,7 @@ def _drawing(
     return SlotDrawing(
         slot=number,
         block=block,
-        shape=shape.name,
+        shape=stack.names[block],
         border=(half @ slot[:2, :2].T + [x, y]) * 1e3,
         outline=_hull(corners[:, :2]) * 1e3,
         front=(front - middle) * 1e3,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from dataclasses import replace
 from itertools import pairwise
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.robot.planning.arm_model import ArmModel, arm_model
+from stackgen.robot.planning.clearance import load_arm
 from stackgen.robot.planning.kinematics import (
     SOLVERS,
     TOLERANCE,
@@ -30,6 +32,7 @@ from stackgen.robot.planning.staging import TIP_UP
 from stackgen.robot.planning.urdf import arm_file, chain_links, chain_urdf, self_collision_pairs
 from stackgen.robot.workcell import ArmDescription, Base, Staging, Workcell, pose
 from stackgen.sim.physics import Physics
+from stackgen.sim.simulator import bullet
 from stackgen.stack import Stack
 from tests.robot.real import standin
 
@@ -167,14 +170,39 @@ def test_a_chain_that_is_not_there_is_an_error(changed: dict[str, str], message:
         ArmModel(replace(UR5, **changed))
 
 
-def test_what_is_no_urdf_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / "arm.urdf").write_text("a photo")
-    with pytest.raises(StackgenError, match="is no URDF"):
+@pytest.mark.parametrize(
+    ("pattern", "written", "message"),
+    [
+        ("(?s).*", "a photo", "is no URDF"),
+        ('<link name="upper_arm_link">', '<link name="other">', "the chain has no link upper_arm_link"),
+        ("package://", "package://nowhere/", "the mesh package://nowhere/.* is not there"),
+        ('parent link="base_link"', 'parent link="tool0"', "no chain leads from base_link to tool0"),
+        ('rpy="[^"]*" xyz="[^"]*"', 'xyz="a b c"', "cannot be read: .* valid URDF"),
+    ],
+)
+def test_what_is_no_urdf_is_an_error(tmp_path: Path, pattern: str, written: str, message: str) -> None:
+    (tmp_path / "arm.urdf").write_text(re.sub(pattern, written, arm_file(UR5.urdf).read_text()))
+    with pytest.raises(StackgenError, match=message):
         ArmModel(replace(UR5, urdf=str(tmp_path / "arm.urdf")))
 
 
-def test_a_joint_without_limits_turns_by_two_turns(tmp_path: Path) -> None:
-    text = arm_file(UR5.urdf).read_text().replace('type="revolute"', 'type="continuous"')
+def test_what_bullet_cannot_load_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "arm.urdf").write_text(re.sub("<mesh [^>]*/>", "<blob/>", arm_file(UR5.urdf).read_text()))
+    client = bullet.connect(bullet.DIRECT)
+    with pytest.raises(StackgenError, match="cannot be read"):
+        load_arm(replace(WORKCELL, arm=replace(UR5, urdf=str(tmp_path / "arm.urdf"))), client, visual=False)
+    bullet.disconnect(client)
+
+
+def test_what_is_no_srdf_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "arm.srdf").write_text("a photo")
+    with pytest.raises(StackgenError, match="is no SRDF"):
+        self_collision_pairs(replace(UR5, srdf=str(tmp_path / "arm.srdf")))
+
+
+@pytest.mark.parametrize("pattern", ['type="revolute"', "<limit [^>]*/>"])
+def test_a_joint_without_limits_turns_by_two_turns(tmp_path: Path, pattern: str) -> None:
+    text = re.sub(pattern, 'type="continuous"' if "type" in pattern else "", arm_file(UR5.urdf).read_text())
     (tmp_path / "arm.urdf").write_text(text)
     arm = ArmModel(replace(UR5, urdf=str(tmp_path / "arm.urdf")))
     assert np.allclose([arm.lower, arm.upper], [[-2 * np.pi] * 6, [2 * np.pi] * 6])
