@@ -6,6 +6,7 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ from rich.table import Table
 from stackgen.api import DEFAULT
 from stackgen.commands.parsing import Command, Files
 from stackgen.commands.progress_bar import progress_bar
-from stackgen.commands.real_arm import RealArm, build_for_real, check_options, placed_before, write_sheet
+from stackgen.commands.real_arm import RealArm, build_for_real, check_options, write_sheet
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_json
 from stackgen.io.stacks_file import StackEntry, StacksFile, read_stacks, write_stacks
@@ -93,6 +94,7 @@ def main(wanted: Wanted, simulation: Simulation, real: RealArm, file: Path | Non
         real: Who builds, and what a real arm needs.
         file: A stacks.json.
     """
+    from stackgen.robot.build import plan_stack
     from stackgen.robot.candidates import first_buildable
     from stackgen.sim.physics import Physics
 
@@ -100,15 +102,16 @@ def main(wanted: Wanted, simulation: Simulation, real: RealArm, file: Path | Non
     content = _from_file(file, wanted) if wanted.from_image is None else _from_image(wanted.from_image, file, wanted)
     physics = replace(Physics.recorded(content.physics), cell_size=content.cell_size)
     with progress_bar("plan", len(content.stacks[0])) as (advance, say):
-        planned = first_buildable(
-            content.stacks,
-            wanted.cell,
-            physics,
+        plan = partial(
+            plan_stack,
+            workcell=wanted.cell,
+            physics=physics,
             strategy=wanted.order,
             solver=wanted.solver,
             placed=placed,
             on_block=advance,
         )
+        planned = first_buildable(content.stacks, plan)
         if not planned.design.order.safe:
             say(f"the greedy order is not safe: {planned.design.order.blocked}")
     try:
@@ -128,6 +131,7 @@ def main(wanted: Wanted, simulation: Simulation, real: RealArm, file: Path | Non
 
 def _check_options(wanted: Wanted, simulation: Simulation, real: RealArm) -> int:
     """See that the options go together; return how many blocks stand already."""
+    from stackgen.robot.real.real_build import placed_before
     from stackgen.robot.simulated.film import check_film
     from stackgen.robot.simulated.window import require_display
 

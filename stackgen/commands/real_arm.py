@@ -77,13 +77,6 @@ def check_options(real: RealArm, only_simulated: bool) -> None:
         raise StackgenError("--resume goes with --arm ur-rtde: a program that the arm runs alone keeps no progress")
 
 
-def placed_before(out: Path, resume: bool) -> int:
-    """Read how many blocks stand already."""
-    from stackgen.robot.real.real_build import placed_before
-
-    return placed_before(out, resume)
-
-
 def write_sheet(real: RealArm, planned: PlannedBuild) -> None:
     """Write the staging sheet, if one was asked for."""
     if real.staging_sheet is None:

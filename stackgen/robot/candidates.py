@@ -10,12 +10,8 @@ from stackgen.api import Model
 from stackgen.errors import StackgenError
 from stackgen.geometry import iou
 from stackgen.io.stacks_file import StacksFile
-from stackgen.robot.build import PlannedBuild, plan_stack
-from stackgen.robot.planning.build_order import Strategy
-from stackgen.robot.planning.kinematics import SolverName
-from stackgen.robot.workcell import Workcell
+from stackgen.robot.build import PlannedBuild
 from stackgen.sampling.verified import Budget
-from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
 from stackgen.vision.depth import find_structure, is_depth, read_frame
 from stackgen.vision.drawings import read_silhouette
@@ -43,7 +39,11 @@ def silhouette_of(picture: Path, grid: Grid) -> Mask:
         StackgenError: If nothing is seen.
     """
     if is_depth(picture):
-        return find_structure(read_frame(picture), grid).silhouette
+        frame = read_frame(picture)
+        try:
+            return find_structure(frame, grid).silhouette
+        except StackgenError as error:
+            raise StackgenError(f"{picture}: {error}") from error
     try:
         sketch = read_sketch(picture, grid).silhouette
     except StackgenError:
@@ -91,21 +91,12 @@ def stacks_of_picture(
     return replace(found, entries=standing, silhouette=picture.name)
 
 
-def first_buildable(
-    stacks: Sequence[Stack],
-    workcell: Workcell,
-    physics: Physics,
-    *,
-    strategy: Strategy = "safest",
-    solver: SolverName = "urdf",
-    placed: int = 0,
-    on_block: Callable[[int], None] = lambda done: None,
-) -> PlannedBuild:
+def first_buildable(stacks: Sequence[Stack], plan: Callable[[Stack], PlannedBuild]) -> PlannedBuild:
     """Plan the first stack that can be built.
 
     Args:
         stacks: Stacks to try, the best first; at least one.
-        workcell, physics, strategy, solver, placed, on_block: As for :func:`stackgen.robot.build.plan_stack`.
+        plan: Function that plans a stack, made of :func:`stackgen.robot.build.plan_stack`.
 
     Raises:
         StackgenError: If none can; it says why the first one cannot.
@@ -113,9 +104,7 @@ def first_buildable(
     reasons = []
     for stack in stacks:
         try:
-            return plan_stack(
-                stack, workcell, physics, strategy=strategy, solver=solver, placed=placed, on_block=on_block
-            )
+            return plan(stack)
         except StackgenError as error:
             reasons.append(error)
     raise reasons[0]

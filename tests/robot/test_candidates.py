@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from stackgen.api import Model
 from stackgen.errors import StackgenError
 from stackgen.geometry import iou
+from stackgen.robot.build import plan_stack
 from stackgen.robot.candidates import first_buildable, silhouette_of, stacks_of_picture
 from stackgen.robot.workcell import Staging, Workcell
 from stackgen.sim.physics import Physics
@@ -27,7 +29,7 @@ def cube(x: float, z: float) -> Stack:
     return Stack(np.array([0]), np.array([[x, 0, z, 0, 0, 0]]))
 
 
-def test_a_clean_picture_and_the_photo_of_an_outline_are_bothsilhouette_of(tmp_path: Path) -> None:
+def test_a_clean_picture_and_the_photo_of_an_outline_are_both_read(tmp_path: Path) -> None:
     clean = silhouette_of(ROOT / "examples" / "silhouettes" / "arch.png", PAPER_GRID)
     assert np.array_equal(clean, read_silhouette(ROOT / "examples" / "silhouettes" / "arch.png", PAPER_GRID))
     light = np.linspace(150, 235, 400)[None, :] * np.ones((300, 1))  # paper in uneven light
@@ -47,17 +49,24 @@ def test_a_depth_frame_is_seen_as_capture_does() -> None:
     assert iou(seen, house) > 0.98  # the same house
 
 
+def test_the_line_about_a_depth_frame_names_its_file(tmp_path: Path) -> None:
+    np.save(tmp_path / "wall.npy", np.full((120, 160), 1.0))
+    with pytest.raises(StackgenError, match=r"wall\.npy: nothing stands in front"):
+        silhouette_of(tmp_path / "wall.npy", PAPER_GRID)
+
+
 def test_the_first_stack_that_can_be_built_is_planned() -> None:
     hanging, far, near = cube(0, 2.5), cube(30, 0.5), cube(1, 0.5)
     placed: list[int] = []
-    planned = first_buildable([hanging, far, near], WORKCELL, Physics(), solver="closed-form", on_block=placed.append)
+    plan = partial(plan_stack, workcell=WORKCELL, physics=Physics(), solver="closed-form", on_block=placed.append)
+    planned = first_buildable([hanging, far, near], plan)
     assert planned.design.stack.poses[0, 0] == pytest.approx(1, abs=0.01)
     assert planned.plan.order == (0,) and placed == [1]
 
 
 def test_where_none_can_be_built_the_first_says_why() -> None:
     with pytest.raises(StackgenError, match=r"block 0 \(cube\) would fall"):
-        first_buildable([cube(0, 2.5), cube(30, 0.5)], WORKCELL, Physics())
+        first_buildable([cube(0, 2.5), cube(30, 0.5)], partial(plan_stack, workcell=WORKCELL, physics=Physics()))
 
 
 def test_of_a_picture_only_stacks_that_stand_are_kept_the_best_first(towers: Model) -> None:
