@@ -66,14 +66,14 @@ def main() -> None:
     asked = list(cases(options.number, options.seed, options.weights))
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
         answers = list(track(pool.map(answer, asked, chunksize=4), "simulating", total=len(asked)))
-    figures = {
+    metrics = {
         "fast": Physics().to_json(),
         "slow": SLOW.to_json(),
         "fine": FINE.to_json(),
         "certificate": vars(StaticsMargins()),
         **count(asked, answers),
     }
-    report("agreement", figures, tables(figures), options.out)
+    report("agreement", metrics, tables(metrics), options.out)
 
 
 def cases(number: int, seed: int, weights: str) -> Iterator[Case]:
@@ -181,13 +181,13 @@ def count(asked: Sequence[Case], answers: Sequence[dict[str, Any]]) -> dict[str,
     return {"stages": stages, "disagreements": listed}
 
 
-def tables(figures: dict[str, Any]) -> list[Any]:
+def tables(metrics: dict[str, Any]) -> list[Any]:
     """The tables to print."""
     rows = [
         [stage, str(row["number"])]
         + [f"{row[name] / row['number']:.2%}" for name in COUNTED[1:-1]]
         + [str(row["certain_wrong"])]
-        for stage, row in figures["stages"].items()
+        for stage, row in metrics["stages"].items()
     ]
     agreements = ("fast = slow", "fast = fine", "slow = fine", "both accept or neither")
     headings = ("stage", "stacks", "fall", *agreements, "statics certain", "and wrong")
@@ -195,7 +195,7 @@ def tables(figures: dict[str, Any]) -> list[Any]:
     disputes = [
         [f"{d['stage']} {d['number']}", str(d["blocks"]), *(words[d[name]] for name in ("fast", "slow", "fine"))]
         + [d["statics"]]
-        for d in figures["disagreements"]
+        for d in metrics["disagreements"]
     ]
     return [
         plain_table("Fast against slow and fine", headings, rows),

@@ -24,9 +24,9 @@ def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
     options.add_argument("--data", type=Path, default=Path("data/base.npz"), help="dataset folder or .npz")
-    options.add_argument("--heads", nargs="+", choices=HEADS, default=list(HEADS))
+    options.add_argument("--heads", nargs="+", choices=HEADS, default=list(HEADS), help="heads to train")
     options.add_argument("--steps", type=int, default=300, help="steps of training")
-    options.add_argument("--batch_size", type=int, default=128)
+    options.add_argument("--batch_size", type=int, default=128, help="pictures of a step")
     options.add_argument("--number", type=int, default=1000, help="validation stacks")
     options.add_argument("--seed", type=int, default=0, help="seed of the weights and the order of the stacks")
     return options

@@ -33,7 +33,7 @@ def parser() -> argparse.ArgumentParser:
     options = argument_parser(__name__, __doc__)
     options.add_argument("--scenes", type=int, default=500, help="scenes of the test set")
     options.add_argument("--num_samples", type=int, default=3, help="stacks for each scene and list")
-    options.add_argument("--processes", type=int, default=1, help="that share the scenes")
+    options.add_argument("--processes", type=int, default=1, help="processes that share the scenes")
     options.add_argument("--naive", type=int, default=3, help="scenes for the naive loop, one stack each; 0 for none")
     options.add_argument("--block_list_weights", default="default", help="weights of the block-list network")
     return options

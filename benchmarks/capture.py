@@ -64,14 +64,14 @@ def main() -> None:
     rng = np.random.default_rng(options.seed)
     model = load()
     cases = [case(stack, rng, model) for stack in track(drawn(options.number, options.seed), "seeing")]
-    figures = {
+    metrics = {
         "stacks": len(cases),
         "seed": options.seed,
         "made_of_whole_cells": estimate([case.whole for case in cases]),
         "in_one_part": int(sum(case.left_out < 0.05 for case in cases)),
         **{kind: summary(cases, number) for number, kind in enumerate(KINDS)},
     }
-    report("capture", figures, [table(figures)], options.out)
+    report("capture", metrics, [table(metrics)], options.out)
 
 
 def case(stack: Stack, rng: np.random.Generator, model: Model) -> Case:
@@ -110,14 +110,14 @@ def summary(cases: Sequence[Case], kind: int) -> dict[str, Any]:
     }
 
 
-def table(figures: Mapping[str, Any]) -> Any:
+def table(metrics: Mapping[str, Any]) -> Any:
     """The table to print."""
 
     def share(e: Mapping[str, float]) -> str:
         return f"{100 * e['value']:.1f} ({100 * e['low']:.1f} to {100 * e['high']:.1f})"
 
     names = ("iou", "iou_in_one_part", "verified_stands", "verified_iou_in_one_part")
-    rows = [[kind, *(share(figures[kind][name]) for name in names)] for kind in KINDS]
+    rows = [[kind, *(share(metrics[kind][name]) for name in names)] for kind in KINDS]
     headings = (
         "silhouette",
         "IoU with the stack's own [%]",
@@ -126,8 +126,8 @@ def table(figures: Mapping[str, Any]) -> Any:
         "IoU of that with the stack's own, in one part [%]",
     )
     title = (
-        f"{figures['stacks']} stacks before a camera, {figures['in_one_part']} of them in one part;"
-        f" {share(figures['made_of_whole_cells'])} % made of whole cells"
+        f"{metrics['stacks']} stacks before a camera, {metrics['in_one_part']} of them in one part;"
+        f" {share(metrics['made_of_whole_cells'])} % made of whole cells"
     )
     return plain_table(title, headings, rows)
 

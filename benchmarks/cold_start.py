@@ -1,6 +1,6 @@
 """From `stackgen sample` typed to the files written, in a fresh process; and where the time goes in a warm one.
 
-The disk cache is warm after the first run, which is listed on its own. Warm figures leave out what a process
+The disk cache is warm after the first run, which is listed on its own. Warm times leave out what a process
 does once: imports, reading weights, opening the simulator, the first passes of the networks.
 """
 
@@ -26,8 +26,8 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--image", type=Path, default=IMAGE, help="silhouette, from the repository root")
     options.add_argument("--num_samples", type=int, default=3, help="stacks for the image")
     options.add_argument("--runs", type=int, default=10, help="cold processes, and warm repetitions")
-    options.add_argument("--weights", default="default", help="of the sampler")
-    options.add_argument("--block_list_weights", default="default", help="of the block-list network")
+    options.add_argument("--weights", default="default", help="weights of the sampler")
+    options.add_argument("--block_list_weights", default="default", help="weights of the block-list network")
     options.add_argument("--blocks", help="block list such as cube=3; chosen by the network if left out")
     return options
 
@@ -40,7 +40,7 @@ def main() -> None:
         seconds = [child.seconds for child in cold]
         first_call, stages, warm_rss = warm_runs(options, Path(folder) / "warm")
     total = sum(stage["median"] for stage in stages.values())
-    figures: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "num_samples": options.num_samples,
         "cold_seconds": {**summary(seconds), "first": seconds[0]},
         "cold_peak_rss_mb": max(child.peak_rss_mb for child in cold),
@@ -49,7 +49,7 @@ def main() -> None:
         "warm_peak_rss_mb": warm_rss,
         "warm_stages": {name: {**stage, "share": stage["median"] / total} for name, stage in stages.items()},
     }
-    report("cold_start", figures, tables(figures), options.out)
+    report("cold_start", metrics, tables(metrics), options.out)
 
 
 def cold_run(options: argparse.Namespace, out: Path) -> Child:
@@ -95,24 +95,24 @@ def repeated(stage: Callable[[], object], runs: int) -> dict[str, float]:
     return summary(seconds)
 
 
-def tables(figures: dict[str, Any]) -> list[Any]:
+def tables(metrics: dict[str, Any]) -> list[Any]:
     """What is printed."""
-    cold = figures["cold_seconds"]
+    cold = metrics["cold_seconds"]
     totals = plain_table(
-        f"stackgen sample, one image, {figures['num_samples']} samples, {cold['runs']} runs",
+        f"stackgen sample, one image, {metrics['num_samples']} samples, {cold['runs']} runs",
         ("", "median [s]", "min", "max", "first", "peak RSS [MB]"),
         [
             [
                 "cold: typed to written",
                 *(f"{cold[key]:.2f}" for key in ("median", "min", "max", "first")),
-                f"{figures['cold_peak_rss_mb']:.0f}",
+                f"{metrics['cold_peak_rss_mb']:.0f}",
             ],
             [
                 "warm: all stages",
-                f"{figures['warm_seconds']:.3f}",
-                *(f"{sum(s[key] for s in figures['warm_stages'].values()):.3f}" for key in ("min", "max")),
-                f"{figures['warm_first_call_seconds']:.2f}",
-                f"{figures['warm_peak_rss_mb']:.0f}",
+                f"{metrics['warm_seconds']:.3f}",
+                *(f"{sum(s[key] for s in metrics['warm_stages'].values()):.3f}" for key in ("min", "max")),
+                f"{metrics['warm_first_call_seconds']:.2f}",
+                f"{metrics['warm_peak_rss_mb']:.0f}",
             ],
         ],
     )
@@ -124,7 +124,7 @@ def tables(figures: dict[str, Any]) -> list[Any]:
             f"{1000 * s['max']:.1f}",
             f"{100 * s['share']:.0f}",
         ]
-        for name, s in figures["warm_stages"].items()
+        for name, s in metrics["warm_stages"].items()
     ]
     headings = ("warm stage", "median [ms]", "min", "max", "share [%]")
     return [totals, plain_table("Where the time of a warm call goes", headings, rows)]

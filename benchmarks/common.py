@@ -35,7 +35,7 @@ class Child:
 
     Args:
         output: What it printed.
-        seconds: From its start to its end [s].
+        seconds: Time from its start to its end [s].
         peak_rss_mb: Largest resident memory [MB].
     """
 
@@ -51,7 +51,7 @@ def run_child(arguments: Sequence[str], threads: int | None = None) -> Child:
 
     Args:
         arguments: Words of the command.
-        threads: For OpenMP; by default what the environment says.
+        threads: Threads of OpenMP; by default what the environment says.
 
     Raises:
         StackgenError: If it fails; the message ends with its last line.

@@ -47,9 +47,9 @@ def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
     options.set_defaults(out=LIMIT_FILE)
-    options.add_argument("--scenes", type=int, default=500, help="how many, evenly spread over the test set")
+    options.add_argument("--scenes", type=int, default=500, help="scenes, evenly spread over the test set")
     options.add_argument("--placements", type=int, default=PLACEMENTS, help="displaced placements to try of a design")
-    options.add_argument("--block_list_weights", default="default", help="the network that predicts the other list")
+    options.add_argument("--block_list_weights", default="default", help="weights of the block-list network")
     options.add_argument("--workers", type=int, default=1, help="processes that search")
     return options
 

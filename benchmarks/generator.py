@@ -31,7 +31,7 @@ from stackgen.stack import Stack
 from stackgen.world import PAPER_WORLD
 
 EVERY = 3
-"""Of so many templates one is simulated throughout, too."""
+"""One of so many templates is also made by simulating everything."""
 
 
 class Counting(Simulator):
@@ -42,7 +42,7 @@ class Counting(Simulator):
     seconds = 0.0
 
     def rollout(self, stack: Stack, **options: Any) -> Rollout:
-        """As the simulator does."""
+        """Simulate, and count."""
         begin = time.process_time()
         rollout = super().rollout(stack, **options)
         self.seconds += time.process_time() - begin
@@ -53,12 +53,12 @@ class Counting(Simulator):
 
 @dataclass(frozen=True)
 class Recording(Settler):
-    """A settler that writes down what statics said of each rest."""
+    """A settler that writes down what statics said of each remainder."""
 
     said: list[tuple[Stack, Outcome]] = field(default_factory=list)
 
     def settle_rest(self, rest: Settled) -> Settled | None:
-        """As every settler does."""
+        """Settle a remainder, and write down what statics said of it."""
         self.said.append((rest.stack, rest.outcome))
         return super().settle_rest(rest)
 
@@ -67,7 +67,7 @@ def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
     options.add_argument("--templates", type=int, default=150, help="templates whose stacks are made")
-    options.add_argument("--seed", type=int, default=1000, help="of the templates")
+    options.add_argument("--seed", type=int, default=1000, help="seed of the templates")
     return options
 
 
@@ -81,7 +81,7 @@ def main() -> None:
     numbers = range(options.templates)
     families, cost = made(settings, numbers, "making")
     _, simulated = made(plain, numbers[::EVERY], "simulating everything")
-    figures: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "settings": settings.to_json(),
         "physics": settings.physics.to_json(),
         "cost": {"generator": cost, "everything simulated once": simulated},
@@ -89,7 +89,7 @@ def main() -> None:
         "stored": put_down_again(families),
         "peak_rss_mb": peak_rss_mb(),
     }
-    report("generator", figures, tables(figures), options.out)
+    report("generator", metrics, tables(metrics), options.out)
 
 
 def made(settings: GenerateSettings, numbers: Sequence[int], what: str) -> tuple[list[list[Stack]], dict[str, float]]:
@@ -122,9 +122,9 @@ def made(settings: GenerateSettings, numbers: Sequence[int], what: str) -> tuple
 
 
 def decisions(settings: GenerateSettings, numbers: Sequence[int]) -> dict[str, Any]:
-    """What statics said of rests, and what the simulator says of those of which it was certain.
+    """What statics said of remainders, and what the simulator says of those of which it was certain.
 
-    What hangs in the air by the plainest of looks is left out: nobody is in doubt of that.
+    Remainders with a block that plainly hangs in the air are left out: nobody doubts those.
     """
     counts = {word: {"number": 0, "not_accepted": 0, "fell": 0} for word in ("stands", "falls", "unsure")}
     wrong: list[dict[str, Any]] = []
@@ -179,18 +179,18 @@ def _seen(stack: Stack, rollout: Rollout) -> dict[str, Any]:
     return {"blocks": len(stack), "moved": moved, "at_rest": rollout.at_rest, "time": rollout.time}
 
 
-def tables(figures: dict[str, Any]) -> list[Any]:
+def tables(metrics: dict[str, Any]) -> list[Any]:
     """What is printed."""
     cost = [
         [name, str(row["templates"]), str(row["stored"])]
         + [f"{row[key]:.2f}" for key in ("milliseconds", "milliseconds_simulating", "rollouts", "steps")]
-        for name, row in figures["cost"].items()
+        for name, row in metrics["cost"].items()
     ]
     said = [
         [word, str(row["number"])] + ([str(row["not_accepted"]), str(row["fell"])] if word != "unsure" else ["", ""])
-        for word, row in figures["decisions"]["counts"].items()
+        for word, row in metrics["decisions"]["counts"].items()
     ]
-    stored = figures["stored"]
+    stored = metrics["stored"]
     again = [
         [name, str(stored["number"])] + [f"{100 * stored[name][key]:.2f}" for key in ("value", "low", "high")]
         for name in ("stand", "accepted")

@@ -37,8 +37,8 @@ class Kill:
     Args:
         dataset: Number of the dataset that was being made.
         what: `job` (parent and workers), `parent` or `worker`.
-        workers: Of the run.
-        shards: That were whole at that moment.
+        workers: Number of workers of the run.
+        shards: Number of shards that were whole at that moment.
         workers_gone: How long workers outlived their parent [s]; None where a worker was killed.
         identical: Whether the dataset ended with the bytes of the undisturbed one.
     """
@@ -53,14 +53,14 @@ class Kill:
 
 @dataclass(frozen=True)
 class Recipe:
-    """What is made, and how it is called."""
+    """Dataset that is made, and the command that makes it."""
 
     stacks: int
     templates_per_shard: int
     seed: int
 
     def command(self, out: Path, workers: int) -> list[str]:
-        """Of a run."""
+        """Words of a run's command line."""
         options = {
             "name": "kills",
             "stacks": self.stacks,
@@ -78,10 +78,10 @@ class Recipe:
 def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
-    options.add_argument("--kills", type=int, default=20, help="how many")
-    options.add_argument("--stacks", type=int, default=400, help="of the dataset")
-    options.add_argument("--templates_per_shard", type=int, default=4, help="small, for many moments in between")
-    options.add_argument("--seed", type=int, default=0, help="of the dataset and of the kills")
+    options.add_argument("--kills", type=int, default=20, help="number of kills")
+    options.add_argument("--stacks", type=int, default=400, help="stacks of the dataset")
+    options.add_argument("--templates_per_shard", type=int, default=4, help="templates of a shard")
+    options.add_argument("--seed", type=int, default=0, help="seed of the dataset and of the kills")
     return options
 
 
@@ -97,7 +97,7 @@ def main() -> None:
         wanted = checksums(undisturbed)
         kills = torture(recipe, Path(folder), wanted, options.kills, np.random.default_rng(options.seed))
     shards = sum(name.endswith(".tar") for name in wanted)
-    figures = {
+    metrics = {
         "dataset": {**asdict(recipe), "shards": shards, "undisturbed_seconds": round(child.seconds, 1)},
         "kills": [asdict(kill) for kill in kills],
         "datasets": 1 + max(kill.dataset for kill in kills),
@@ -116,8 +116,8 @@ def main() -> None:
         for number, kill in enumerate(kills, 1)
     ]
     headings = ["kill", "of the", "workers", "whole shards", "workers gone [s]", "dataset", "its bytes in the end"]
-    report("kills", figures, [plain_table(f"kill -9, {len(kills)} times", headings, rows)], options.out)
-    if not figures["identical"]:
+    report("kills", metrics, [plain_table(f"kill -9, {len(kills)} times", headings, rows)], options.out)
+    if not metrics["identical"]:
         raise StackgenError("a dataset that was killed ended with other bytes")
 
 
@@ -152,9 +152,9 @@ class Run:
     """A command in a session of its own.
 
     Args:
-        recipe: What it makes.
-        out: Where.
-        workers: How many.
+        recipe: Recipe of the dataset that it makes.
+        out: Folder of the dataset.
+        workers: Number of workers.
     """
 
     def __init__(self, recipe: Recipe, out: Path, workers: int) -> None:
@@ -211,7 +211,7 @@ class Run:
         return len(list(self.out.glob("*.tar")))
 
     def pids(self) -> list[int]:
-        """Of the workers."""
+        """Process ids of the workers."""
         command = ["ps", "-ww", "-s", str(self.process.pid), "-o", "pid=,args="]
         lines = subprocess.run(command, capture_output=True, text=True, check=False).stdout.splitlines()
         return [int(line.split()[0]) for line in lines if "spawn_main" in line]
@@ -237,7 +237,7 @@ def signal_9(pid: int) -> None:
 
 
 def checksums(folder: Path) -> dict[str, str]:
-    """Of every file in a dataset."""
+    """Checksums of every file in a dataset."""
     files = (path for path in sorted(folder.rglob("*")) if path.is_file())
     return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 

@@ -35,7 +35,7 @@ METRICS = ("stability", "front_iou", "iou_given_stable")
 DRAWINGS = Path("examples/silhouettes")
 
 Disturb = Callable[[Mask, np.random.Generator], Mask]
-"""Of a picture with PAD pixels more on every side."""
+"""Function that disturbs a picture with PAD pixels added on every side."""
 
 PAD = 32
 """Room in which a disturbed structure may move before it is framed again [pixel]."""
@@ -47,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
     names = ["brute-force", "greedy-random", "default"]
     options.add_argument("--weights", nargs="+", default=names, help="methods: names, files of weights or run folders")
     options.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS), help="kinds of silhouettes")
-    options.add_argument("--scenes", type=int, default=50, help="how many, evenly spread over the test set")
+    options.add_argument("--scenes", type=int, default=50, help="scenes, evenly spread over the test set")
     options.add_argument("--num_samples", type=int, default=3, help="samples of each scene")
     options.add_argument("--verified", action="store_true", help="add verified sampling with the last of the weights")
     options.add_argument("--draws", type=int, default=64, help="stacks that verified sampling may draw for a scene")
@@ -59,9 +59,9 @@ def disturbed(mask: Mask, disturb: Disturb, rng: np.random.Generator, centre: bo
     """The mask (H, W), disturbed, on the ground line; None if it does not fit into the picture any more.
 
     Args:
-        mask: As it is.
-        disturb: What happens to it.
-        rng: Of what is random in that.
+        mask: Silhouette to disturb.
+        disturb: Function that disturbs it.
+        rng: Source of what is random in that.
         centre: Move it to the middle where it would be cut off.
     """
     found = disturb(np.pad(mask, PAD), rng)

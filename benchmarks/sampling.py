@@ -63,7 +63,7 @@ def parser() -> argparse.ArgumentParser:
     )
     options.add_argument("--steps", nargs="+", type=int, default=[50, 25, 16, 10, 8, 5, 4], help="calls of the network")
     options.add_argument("--spacing", type=float, default=None, help="spacing of the steps, see SamplerConfig")
-    options.add_argument("--checker", choices=get_args(CheckerName), default="simulator", help="which stacks stand")
+    options.add_argument("--checker", choices=get_args(CheckerName), default="simulator", help="checker that chooses")
     options.add_argument("--draws", type=int, default=64, help="stacks that verified sampling may draw for a scene")
     options.add_argument("--runs", type=int, default=10, help="timed calls a row")
     return options

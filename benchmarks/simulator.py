@@ -43,8 +43,8 @@ def main() -> None:
         timed(f"noise {options.noise:g}", noisy, until_fall=True),
         timed(f"noise {options.noise:g}, whole watch", noisy, until_fall=False),
     ]
-    figures = {"physics": Physics().to_json(), "speed": rows, "peak_rss_mb": peak_rss_mb()}
-    report("simulator", figures, [speed_table(rows, peak_rss_mb())], options.out)
+    metrics = {"physics": Physics().to_json(), "speed": rows, "peak_rss_mb": peak_rss_mb()}
+    report("simulator", metrics, [speed_table(rows, peak_rss_mb())], options.out)
 
 
 def testset_stacks() -> list[Stack]:

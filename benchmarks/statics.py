@@ -68,7 +68,7 @@ def main() -> None:
     stacks = from_files(options.files) if options.files else drawn(options)
     simulator, statics = SimulatorChecker(), StaticsChecker(safety=0)
     cases = [Case(*named, simulator.check(named[2]), statics.answer(named[2])) for named in stacks]
-    figures: dict[str, Any] = {
+    metrics: dict[str, Any] = {
         "physics": simulator.physics.to_json(),
         "contact_tolerance": CONTACT_TOLERANCE,
         "safety": SAFETY,
@@ -78,7 +78,7 @@ def main() -> None:
         "milliseconds": times([case.stack for case in cases]),
         "disagreements": disagreements(cases),
     }
-    report("statics", figures, tables(figures), options.out)
+    report("statics", metrics, tables(metrics), options.out)
 
 
 def from_files(files: Sequence[Path]) -> list[tuple[str, str, Stack]]:
@@ -214,28 +214,28 @@ def disagreements(cases: Sequence[Case]) -> list[dict[str, Any]]:
     ]
 
 
-def tables(figures: dict[str, Any]) -> list[Any]:
+def tables(metrics: dict[str, Any]) -> list[Any]:
     """The tables to print."""
     shares = ("agree", "false_stable", "false_unstable")
     percent = [f"{name.replace('_', ' ')} [%]" for name in shares]
     verdicts = [
         [r["stacks"], str(r["number"]), f"{100 * r['stand']:.1f}", f"{math.degrees(r['safety']):.1f}"]
         + [f"{100 * r[share]:.1f}" for share in shares]
-        for r in figures["agreement"]
+        for r in metrics["agreement"]
     ]
     by_tolerance = [
         [r["stacks"], f"{r['tolerance']:.2f}"] + [f"{100 * r[share]:.1f}" for share in shares]
-        for r in figures["tolerances"]
+        for r in metrics["tolerances"]
     ]
-    costs = figures["milliseconds"]
+    costs = metrics["milliseconds"]
     spent = [[f"{size} blocks", f"{value:.2f}"] for size, value in costs["by_blocks"].items()]
     spent += [[name.replace("_", " "), f"{costs[name]:.2f}"] for name in costs if name != "by_blocks"]
     listed = [
         [f"{r['stacks']} {r['name']}", r["statics"], r["pybullet"]]
         + [f"{r['margin_degrees']:.2f}", f"{r['largest_move_cells']:.2f}"]
-        for r in figures["disagreements"]
+        for r in metrics["disagreements"]
     ]
-    named = [[name.replace("_", " "), f"{value:.3g}"] for name, value in figures["unheld"].items()]
+    named = [[name.replace("_", " "), f"{value:.3g}"] for name, value in metrics["unheld"].items()]
     compared_headings = ("stacks", "number", "stand [%]", "safety [degree]", *percent)
     tolerance_headings = ("stacks", "tolerance [cell]", *percent)
     listed_headings = ("stack", "statics", "PyBullet", "margin [degree]", "largest move [cell]")

@@ -41,10 +41,10 @@ def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
     options.add_argument("--data", type=Path, help="dataset folder; made from testset-v1 if left out")
-    options.add_argument("--stacks", type=int, default=100_000, help="of the dataset that is made")
-    options.add_argument("--batch_size", type=int, default=4096)
+    options.add_argument("--stacks", type=int, default=100_000, help="stacks of the dataset that is made")
+    options.add_argument("--batch_size", type=int, default=4096, help="stacks of a batch")
     options.add_argument("--repeats", type=int, default=3, help="epochs that are timed, after one that is not")
-    options.add_argument("--paths", nargs="+", choices=PATHS, default=list(PATHS), metavar="PATH")
+    options.add_argument("--paths", nargs="+", choices=PATHS, default=list(PATHS), metavar="PATH", help="ways to read")
     options.add_argument("--child", help=argparse.SUPPRESS)
     return options
 
@@ -76,14 +76,14 @@ def main() -> None:
     ]
     headings = ("path", "samples/s", "samples/CPU s", "RSS [MB]", "worker [MB]")
     what = options.data.name if given else "testset-v1, repeated"
-    figures = {
+    metrics = {
         "data": what,
         "stacks": rows[0]["stacks"] if rows else 0,
         "batch_size": options.batch_size,
         "rows": rows,
     }
-    title = f"Reading {figures['stacks']:,} stacks ({what}) in batches of {options.batch_size}"
-    report("streams", figures, [plain_table(title, headings, cells)], options.out)
+    title = f"Reading {metrics['stacks']:,} stacks ({what}) in batches of {options.batch_size}"
+    report("streams", metrics, [plain_table(title, headings, cells)], options.out)
 
 
 def in_child(options: argparse.Namespace, path: str) -> str:
@@ -136,7 +136,7 @@ def measure(options: argparse.Namespace, path: str) -> dict[str, Any]:
 
 
 def cpu_seconds() -> float:
-    """Of this process and of those of its workers that have ended [s]."""
+    """Processor time of this process and of those of its workers that have ended [s]."""
     return sum(os.times()[:4])
 
 

@@ -2,7 +2,7 @@
 
 `config` is the network of the configuration; `joint` the paper's encoder over block and silhouette tokens at that
 size; `torch` the same with PyTorch's own `nn.TransformerEncoder` in place of the layers. Lightning trains them as
-`stackgen fit` does: loader, bucketing, mirroring, gradient clipping, AdamW and EMA are in the figures. `plain` is
+`stackgen fit` does: loader, bucketing, mirroring, gradient clipping, AdamW and EMA are measured, too. `plain` is
 what one writes first: `torch`'s network under a Trainer with its defaults, from torch's DataLoader, all ten blocks
 of every sample computed; neither `--precision` nor `--allocator` touches it. A draw is a sample with one noise: what a
 network learns from. The stacks are those of testset-v1, which any clone has, repeated, so that bucketed batches are as
@@ -40,10 +40,10 @@ CONFIG = Path("configs/model/ddpm-small.yaml")
 def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
-    options.add_argument("--config", type=Path, default=CONFIG, help="of a DDPM, from the repository root")
-    options.add_argument("--networks", nargs="+", choices=NETWORKS, default=list(NETWORKS))
-    options.add_argument("--threads", nargs="+", type=int, default=[1, 2])
-    options.add_argument("--precision", help="of Lightning's Trainer; the configuration's if left out")
+    options.add_argument("--config", type=Path, default=CONFIG, help="configuration of a DDPM")
+    options.add_argument("--networks", nargs="+", choices=NETWORKS, default=list(NETWORKS), help="networks to train")
+    options.add_argument("--threads", nargs="+", type=int, default=[1, 2], help="numbers of threads")
+    options.add_argument("--precision", help="precision of Lightning's Trainer; the configuration's if left out")
     options.add_argument("--allocator", action="store_true", help="let glibc keep memory that was freed")
     options.add_argument("--warmup", type=int, default=10, help="steps before the clock starts")
     options.add_argument("--steps", type=int, default=100, help="steps that are timed")
@@ -74,14 +74,14 @@ def main() -> None:
         for row in rows
     ]
     headings = ("network", "threads", "weights", "draws", "steps/s", "samples/s", "draws/s", "x plain", "RSS [MB]")
-    figures = {
+    metrics = {
         "config": str(options.config),
         "steps": options.steps,
         "precision": options.precision,
         "allocator": options.allocator,
         "rows": rows,
     }
-    report("training_speed", figures, [plain_table(f"Training, {options.config}", headings, cells)], options.out)
+    report("training_speed", metrics, [plain_table(f"Training, {options.config}", headings, cells)], options.out)
 
 
 def in_child(options: argparse.Namespace, network: str, threads: int) -> dict[str, Any]:

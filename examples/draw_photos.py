@@ -1,7 +1,7 @@
-"""Makes the photos of examples/photos: `python examples/draw_photos.py [FOLDER]`.
+"""Draws the photos of examples/photos: `python examples/draw_photos.py [FOLDER]`.
 
-Sheets of paper with a drawing, lying on a table, photographed by hand: askew, in uneven light, a little blurred and
-grainy; and frames of a simulated depth camera before a stack on a table.
+They show sheets of paper with a drawing, lying on a table, as if photographed by hand: askew, in uneven light, a little
+blurred and grainy. Beside them are frames of a simulated depth camera before a stack on a table.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Draws the pictures of examples/silhouettes: `python examples/draw_silhouettes.py [FOLDER]`.
 
-Each is designed by hand, corner by corner in its own pixels, as a person would draw it: with a brush
-on paper, as a flat icon, as a photo taken askew in the light. None comes from the generator.
+Each was designed by hand, corner by corner in its own pixels, as a person would draw it: with a brush on paper, as a
+flat icon, as a photo in uneven light. None comes from the generator.
 """
 
 from __future__ import annotations

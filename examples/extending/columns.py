@@ -1,4 +1,4 @@
-"""A method of your own that learns nothing: the blocks in columns, as `stackgen test` and the report measure it."""
+"""A method of your own that learns nothing: it stacks blocks in columns. `stackgen test` and the report take it."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -5,7 +5,7 @@ from stackgen.training import SampleQuality
 
 
 def best_of_all(scene: SceneScore) -> tuple[float, float]:
-    """A metric is a function of one scene's scores: (sum, weight); over scenes it is sum over weight."""
+    """Give (sum, weight) of one scene's scores; over scenes the metric is the sum over the weight."""
     return float(any(sample.valid for sample in scene.samples)), 1
 
 

@@ -11,7 +11,7 @@ from stackgen.world import World
 
 
 class SilhouetteMLP(StackgenModule):
-    """StackgenModule learns the world from the data, and calls `make` when it knows it."""
+    """An MLP. StackgenModule learns the world from the data, and calls `make` when it knows it."""
 
     kind = "silhouette-mlp"
 

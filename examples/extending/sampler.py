@@ -1,4 +1,4 @@
-"""The model of model.py as evaluation, report, drawings and the robot want it: a StackSampler."""
+"""The model of model.py as a StackSampler, which evaluation, report, drawings and the robot take."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -14,7 +14,7 @@ from stackgen.world import Mask
 
 
 class MLPSampler:
-    """One method, `sample_batch`, and what is known of it; here from a module in training, or from a checkpoint."""
+    """A sampler has one method, `sample_batch`; this one is made of a module in training, or of a checkpoint."""
 
     settings: Mapping[str, Any] = {}
 
@@ -33,7 +33,7 @@ class MLPSampler:
 
 
 def load(checkpoint: str) -> SilhouetteMLP:
-    """The module of a checkpoint; only tensors and plain values are read from it."""
+    """Load the module of a checkpoint; only tensors and plain values are read from it."""
     content = torch.load(checkpoint, map_location="cpu", weights_only=True)
     if content.get("stackgen", {}).get("kind") != SilhouetteMLP.kind:
         raise StackgenError(f"{checkpoint} is no checkpoint of a SilhouetteMLP")
