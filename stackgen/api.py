@@ -301,7 +301,7 @@ class Model:
 
 
 def check(checker: StabilityChecker, stack: Stack, target: Mask | None, grid: Grid) -> StackEntry:
-    """Simulate a stack; compare what then stands with a target (H, W). What falls has IoU 0 (SPEC, "IoU")."""
+    """Simulate a stack; compare what then stands with a target (H, W). What falls has IoU 0 (paper)."""
     verdict = checker.check(stack)
     if target is None:
         return StackEntry(stack, verdict)

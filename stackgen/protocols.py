@@ -21,7 +21,7 @@ class Verdict:
     """What became of a stack.
 
     Args:
-        stable: No block fell (SPEC: no centre dropped by more than half a cell).
+        stable: Whether no block fell: no centre sank by more than `Physics.fall_height`.
         fell: (k,) which blocks fell.
         drop: (k,) how far each block's centre sank [cell]; negative if it rose.
         settled: The blocks where they ended.

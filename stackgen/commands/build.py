@@ -38,10 +38,10 @@ class Wanted:
     Args:
         stack: Number of the stack in the file, from 1.
         from_image: Picture, photo of a sketch, or depth frame (as for `stackgen capture`) to build instead of a file:
-            block list, verified stacks, the best of them.
-        inventory: With --from_image, the blocks that there are, such as cube=4,rectangle=3.
+            the best of the verified stacks for it.
+        inventory: With --from_image, blocks that are available, such as cube=4,rectangle=3.
         weights: With --from_image, weights of the sampler: a name, .safetensors, .ckpt or run folder.
-        budget: With --from_image, time such as 5s or number of draws that finding a stack may cost.
+        budget: With --from_image, limit of the search for stacks: a time, such as 5s, or a number of draws.
         seed: Seed of the noise, and with --from_image of the stacks.
         order: Order of placing: the safest, in which every state stands, or the paper's greedy one.
         solver: Inverse-kinematics solver.
@@ -68,7 +68,7 @@ class Simulation:
     Args:
         grasp: Grasp by friction between parallel jaws, or by a fixed constraint, which is faster.
         noise_mm: Standard deviation of the blocks' places from where the robot believes them, in x and y [mm].
-        noise_deg: Standard deviation of their turn [deg].
+        noise_deg: Standard deviation of the blocks' turn from what the robot believes [deg].
         video: Film to write: an .mp4 (H.264, which browsers play) or a .gif, eight times as fast as the arm.
         gui: Show the build in a window, where there is a display.
     """
@@ -92,7 +92,7 @@ def main(wanted: Wanted, simulation: Simulation, real: RealArm, file: Path | Non
         wanted: What is built.
         simulation: What the simulated arm does.
         real: Who builds, and what a real arm needs.
-        file: A stacks.json.
+        file: File of stacks (stacks.json).
     """
     from stackgen.robot.build import plan_stack
     from stackgen.robot.candidates import first_buildable
@@ -267,7 +267,7 @@ COMMAND = Command(
     stackgen build examples/stacks/arch.json --staging_sheet sheet.pdf --arm urscript
     stackgen build examples/stacks/arch.json --arm ur-rtde --host 192.168.0.10 --execute
     """,
-    files=Files("file", "FILE", "A stacks.json.", optional=True),
+    files=Files("file", "FILE", "File of stacks (stacks.json).", optional=True),
     settings={"wanted": Wanted, "simulation": Simulation, "real": RealArm},
     flags={
         "gui": "Show the build in a window, where there is a display.",

@@ -67,8 +67,8 @@ def main(
         depth: Depth frame: a 16-bit PNG in mm, or a .npy in m.
         color: Picture of the same pixels as --depth, for the overlay.
         sketch: Photo of a drawing on paper, filled or in outline.
-        simulate: A stacks.json; a simulated depth camera looks at one of its stacks.
-        stack: Number of that stack, counted from 1.
+        simulate: File of stacks (stacks.json); a simulated depth camera looks at one of them.
+        stack: Number of the stack in the file of --simulate, from 1.
         focal: Focal length of --depth [pixel]; that of a RealSense D435 by default.
         elevation: Angle of the simulated camera above the horizontal [deg].
         azimuth: Angle of the simulated camera to the right of the front [deg].

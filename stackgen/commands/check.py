@@ -27,7 +27,7 @@ def main(
     """Simulate the structures of a stacks file and say which stand; the exit code is 1 if any falls.
 
     Args:
-        file: A stacks.json, made by stackgen or written by hand.
+        file: File of stacks (stacks.json), made by stackgen or written by hand.
         out: File to write the stacks to, with verdicts and settled poses, and with --explain also margins.
         explain: Whether to ask statics, too, and to say why blocks cannot be held.
         physics: Numbers of the simulation; what is not given is as in the file, as far as it describes the blocks.
@@ -81,7 +81,7 @@ COMMAND = Command(
     stackgen check mine.json --out checked.json --physics.friction 0.3
     stackgen check examples/stacks/cantilever.json --explain
     """,
-    files=Files("file", "FILE", "A stacks.json."),
+    files=Files("file", "FILE", "File of stacks (stacks.json), made by stackgen or written by hand."),
     flags={"explain": "Also ask statics for margins, and why blocks cannot be held."},
 )
 

@@ -137,7 +137,7 @@ class StackgenCLI(LightningCLI):
             "--dashboard",
             type=Dashboard,
             default="wandb",
-            help="Where fit's curves and pictures go, beside metrics.csv: wandb is offline without WANDB_API_KEY.",
+            help="Dashboard for curves and pictures, beside metrics.csv; wandb is offline without WANDB_API_KEY.",
         )
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:

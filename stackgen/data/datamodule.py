@@ -35,15 +35,15 @@ class StackDataModule(pl.LightningDataModule):
     Args:
         path: Dataset folder or compact `.npz` file; also behind a URL (`s3://`, `https://`, ...) or a command
             (`pipe:ssh host cat data/{file}`).
-        batch_size: Samples a batch, on each process.
-        mode: Where batches come from: `cached` holds the splits in memory, `stream` reads shards as it goes, `auto`
+        batch_size: Number of samples in a batch, on each process.
+        mode: Source of the batches: `cached` holds the splits in memory, `stream` reads shards as it goes, `auto`
             caches what takes no more than `cache_gb`.
         cache_gb: Memory for the training and validation split together, on each process [GB].
-        num_workers: Reading processes, where data are streamed.
+        num_workers: Number of processes that read a stream, beside each training process.
         bucket_by_blocks: Whether a training batch holds stacks with one number of blocks (nearly one, where they are
             streamed), padding trimmed.
         mirror: Whether to reflect training samples at x = 0 half of the time.
-        samples_per_epoch: Training samples an epoch, over all processes; by default as many as there are.
+        samples_per_epoch: Number of training samples in an epoch, over all processes; by default all that there are.
         eval_batch_size: Batch size of validation and test; by default `batch_size`.
         test_path: Dataset of the test split; by default the frozen `testset-v1`.
         seed: Seed of shuffling and reflections.

@@ -20,7 +20,7 @@ Layout = tuple[tuple[int, ...], ...]
 
 
 def layout(stack: Stack, grid: Grid) -> Layout:
-    """List the shapes of each layer, bottom layer first (SPEC: nearest layer of a block's centre, left to right by x).
+    """List the shapes of each layer, bottom layer first, left to right; a block is in the layer nearest to its centre.
 
     >>> stack = Stack([0, 1, 0], [[1, 0, 0.5, 0, 0, 0], [0, 0, 1.6, 0, 0, 0], [-1, 0, 0.4, 0, 0, 0]])
     >>> layout(stack, Grid())

@@ -31,8 +31,8 @@ class Physics:
         rest_window: Time within which no block of a stack at rest moves more than `rest_motion` [s]; the
             rollout then ends.
         rest_motion: Largest motion of a block at rest [cell].
-        fall_height: Drop of its centre from which on a block fell [cell] (SPEC: half a cell, "to a layer
-            below where it began").
+        fall_height: Drop of its centre from which on a block fell [cell] (paper: "to a layer below where it
+            began", here half a cell).
     """
 
     cell_size: float = 0.05

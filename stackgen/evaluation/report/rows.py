@@ -79,9 +79,9 @@ class ReportSettings:
 
     Args:
         rows: Methods, in their order; by default those of the paper's table.
-        groundwork: What comes before the rows when everything is made from scratch: data, block-list network.
+        groundwork: Steps before the rows when everything is made from scratch: data, block-list network.
         test_set: Dataset whose test scenes are asked about.
-        num_samples: Samples of each scene.
+        num_samples: Number of stacks sampled for each scene.
         seed: Seed of the samplers.
         training_sets: Training sets whose layouts count as seen, by the names that ship with the package; null
             takes all of them.

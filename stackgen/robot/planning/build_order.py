@@ -120,7 +120,7 @@ def greedy_order(stack: Stack) -> tuple[int, ...]:
     >>> greedy_order(Stack([0, 0, 0], [[0.5, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0], [-0.5, 0, 0.5, 0, 0, 0]]))
     (2, 0, 1)
     """
-    layers = np.floor(stack.poses[:, 2])  # SPEC: the nearest layer of a block's centre
+    layers = np.floor(stack.poses[:, 2])  # a block is in the layer nearest to its centre
     return tuple(np.lexsort((stack.poses[:, 0], layers)).tolist())
 
 

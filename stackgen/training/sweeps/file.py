@@ -66,15 +66,15 @@ class Sweep:
 
     Args:
         program: Program that every trial runs.
-        parameters: What is tried: for each name `value`, `values`, or `min` and `max` with a `distribution`.
-        metric: What is optimised.
-        method: How values are proposed: `bayes` learns from the trials so far (here TPE), `random` and `grid` do not.
+        parameters: Parameters to try: for each name `value`, `values`, or `min` and `max` with a `distribution`.
+        metric: Metric that is optimised.
+        method: Way to propose values: `bayes` learns from the trials so far (here TPE), `random` and `grid` do not.
         command: Words of a trial's command line; `${program}`, `${interpreter}`, `${env}`, `${args}` and
             `${args_no_hyphens}` are filled in.
-        early_terminate: When a trial is given up; never if left out.
+        early_terminate: Rule by which a trial is stopped early; without it none is.
         run_cap: Number of trials in all; 30 by default, for a grid all its points.
         name: Name of the sweep; its files go to runs/sweeps/NAME.
-        description: Words for people.
+        description: Description for people.
         project: Project at W&B.
         entity: Account at W&B.
     """
