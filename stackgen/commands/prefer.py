@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -39,24 +38,24 @@ def main(
     """
     from stackgen.data.dataset import Dataset
     from stackgen.data.preferences import prefer
-    from stackgen.evaluation.parallel import ParallelChecker
-    from stackgen.sampling.methods import load_sampler
-    from stackgen.sim.checkers import SimulatorChecker
+    from stackgen.evaluation.parallel import simulating
+    from stackgen.evaluation.requests import Method, load_method, require_one_world
+    from stackgen.sim.physics import Physics
 
-    if scenes < 1 or num_samples < 1:
-        raise StackgenError("prefer: --scenes and --num_samples must be at least 1")
+    if scenes < 1 or num_samples < 1 or (workers is not None and workers < 1) or seed < 0:
+        raise StackgenError("--scenes, --num_samples and --workers must be at least 1, --seed at least 0")
     if out.suffix != ".npz":
-        raise StackgenError(f"prefer: --out must be a .npz file, not {out.name}")
-    train = Dataset.open(data).split("train")
-    sampler = load_sampler(weights)
+        raise StackgenError(f"--out must be a .npz file, not {out.name}")
+    dataset, loaded = Dataset.open(data), load_method(Method(weights))
+    require_one_world(loaded, dataset.world, dataset.manifest.name)
+    train = dataset.split("train")
     chosen = np.random.default_rng(seed).choice(len(train), min(scenes, len(train)), replace=False)
-    factory = partial(SimulatorChecker, until_fall=True)
     with (
-        ParallelChecker(factory, workers or cores()) as checker,
+        simulating(Physics.recorded(dataset.manifest.physics), workers or cores()) as checker,
         progress_bar("scenes", len(chosen)) as (advance, _),
     ):
         pairs = prefer(
-            sampler,
+            loaded.model.sampler,
             checker,
             train.select(chosen),
             num_samples=num_samples,

@@ -1,4 +1,4 @@
-"""Who is tested and how, from weights or a sampler to the requests that are made of it.
+"""What is tested and how: from weights, or a sampler without any, to the requests that are made of it.
 
 A request's **question** is all that its answer depends on, as plain data: the hash in the card of the sampler (of its
 code, where it has no weights), its settings, whose block lists, the scenes, the physics. Equal questions have equal
@@ -177,7 +177,7 @@ def require_one_world(loaded: Loaded, world: World, dataset: str) -> None:
     if other:
         raise StackgenError(
             f"dataset {dataset} has another {' and '.join(other)} than {loaded.weights} was trained with:"
-            " give --test_set of a dataset of its world"
+            " give a dataset of its world"
         )
 
 
