@@ -232,7 +232,7 @@ def main() -> None:
     if min(options.scenes, options.num_samples) < 1:
         raise StackgenError("--scenes and --num_samples must be at least 1")
     from stackgen.data.dataset import TESTSET
-    from stackgen.evaluation.protocol import Request, evaluate, load_scenes, physics_of
+    from stackgen.evaluation.protocol import Request, evaluate, load_scenes
     from stackgen.sampling.methods import load_predictor
     from stackgen.sim.checkers import SimulatorChecker
 
@@ -246,7 +246,7 @@ def main() -> None:
         "test_set": dataset.manifest.sha256,
         "samples_per_scene": options.num_samples,
         "seed": options.seed,
-        "physics": physics_of(checker),
+        "physics": checker.physics.to_json(),
         "rows": rows,
     }
     for kind in options.kinds:

@@ -89,7 +89,7 @@ def main() -> None:
     options = parser().parse_args()
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `stackgen sample` has it; torch reads it when it is imported
     rows = rows_of(options)
-    from stackgen.evaluation.protocol import load_scenes, physics_of
+    from stackgen.evaluation.protocol import load_scenes
     from stackgen.sampling.methods import load_sampler
     from stackgen.sim.checkers import SimulatorChecker
 
@@ -108,7 +108,7 @@ def main() -> None:
         "samples_per_scene": options.num_samples,
         "seed": options.seed,
         "checker": options.checker,
-        "physics": physics_of(checker),
+        "physics": checker.physics.to_json(),
         "rows": [],
     }
     for number, row in enumerate(rows, 1):

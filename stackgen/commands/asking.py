@@ -1,6 +1,6 @@
-"""What `stackgen test` and `stackgen predict` share: whom they ask, and the folder of a run.
+"""What the verbs that ask methods share (`test`, `predict`, `report`): their arguments, methods and run folders.
 
-Configurations of before, when both were verbs of Lightning's command line, are translated here.
+`test` and `predict` were verbs of Lightning's command line once; their configurations of that time are translated here.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _content(value: str) -> dict[str, Any] | None:
 
 
 def is_old_layout(content: Mapping[str, Any]) -> bool:
-    """Say whether a configuration is of the time when the options were those of a LightningModule."""
+    """Tell whether a configuration is of the time when the options were those of a LightningModule."""
     model = content.get("model")
     name = model.get("class_path") if isinstance(model, dict) else model
     return str(name).rpartition(".")[2] == _OLD_MODEL
@@ -120,7 +120,7 @@ def with_checkpoint(method: Method, ckpt_path: Path | None) -> Method:
 def load_both(
     method: Method, ckpt_path: Path | None, test_set: str | None, limit: int | None, split: str = "test"
 ) -> tuple[Loaded, list[Scene], Dataset]:
-    """Load whom to ask, and what: the scenes of a dataset of the same world.
+    """Load a method, and the scenes that it is asked about, from a dataset of the same world.
 
     Raises:
         StackgenError: If one of them is not there, or they do not fit each other.

@@ -5,14 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from stackgen.commands.asking import arguments_of, load_both, open_run
 from stackgen.commands.parsing import Command
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.data.manifest import Split
-from stackgen.errors import StackgenError
-from stackgen.evaluation.protocol import BATCH, batch_seed
+from stackgen.evaluation.protocol import BATCH, batch_seed, block_lists_of, draw
 from stackgen.evaluation.requests import Method
 from stackgen.io.stacks_file import StackEntry, StacksFile, write_stacks
 from stackgen.training.runs import RUNS
@@ -38,32 +35,28 @@ def main(
     runs/NAME/predict_N.
 
     Args:
-        subject: Who is asked.
+        subject: Method that samples.
         config: All options, as YAML.
         ckpt_path: Checkpoint or run folder to sample with: of a sampler, or of a block-list network.
         test_set: Dataset whose scenes are asked about; by default the frozen `testset-v1`.
         split: Split of the dataset.
-        num_samples: Stacks of each scene.
-        seed: Seed of the sampler; with the batch size, the same stacks again.
+        num_samples: Number of stacks sampled for each scene.
+        seed: Seed of the sampler; the same seed and batch size give the same stacks.
         predicted_lists: Whether the network's most likely block lists are asked with instead of the true ones.
         limit: Number of scenes to ask about, from the first; all by default.
-        batch_size: Scenes sampled at once.
+        batch_size: Number of scenes sampled at once.
         name: Name of the run.
         runs: Folder of all runs.
     """
-    if num_samples < 1 or batch_size < 1:
-        raise StackgenError("--num_samples and --batch_size must be at least 1")
     loaded, scenes, dataset = load_both(subject, ckpt_path, test_set, limit, split)
     model = loaded.model
+    request = loaded.requests(None, num_samples, seed, predicted_lists=predicted_lists, batch_size=batch_size)[-1]
     folder = open_run(name, runs, "predict", config, dataset)
     with progress_bar("scenes", len(scenes)) as (advance, _):
         for number, start in enumerate(range(0, len(scenes), batch_size)):
             batch = scenes[start : start + batch_size]
-            masks = np.stack([scene.silhouette for scene in batch])
-            block_lists = np.stack([scene.counts for scene in batch])
-            if predicted_lists:
-                block_lists = model.predictor.predict(masks)[:, 0]
-            samples = model.sampler.sample_batch(masks, block_lists, num_samples, batch_seed(seed, number))
+            block_lists, _ = block_lists_of(request, batch)
+            samples = draw(request, batch, block_lists, batch_seed(seed, number))
             for scene, block_list, stacks in zip(batch, block_lists, samples, strict=True):
                 content = StacksFile(
                     tuple(map(StackEntry, stacks)),
@@ -74,6 +67,7 @@ def main(
                     seed=seed,
                     weights=model.weights,
                     sampler=model.sampler.settings,
+                    cell_size=model.physics.cell_size,
                 )
                 write_stacks(folder / f"{scene.name}.json", content)
             advance(start + len(batch))

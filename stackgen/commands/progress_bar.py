@@ -19,6 +19,11 @@ class Advance(Protocol):
         ...
 
 
+def after(before: int, advance: Advance) -> Callable[[int, int], None]:
+    """Make a function that moves the bar of several jobs by what one of them has done, after those `before` it."""
+    return lambda done, _: advance(before + done)
+
+
 @contextmanager
 def progress_bar(what: str, total: int | None = None) -> Iterator[tuple[Advance, Callable[[str], None]]]:
     """Show a bar until the block ends.

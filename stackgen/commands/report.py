@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 
 from stackgen.commands.asking import arguments_of
 from stackgen.commands.parsing import CONFIG_FLAGS, Command, option_values
-from stackgen.commands.progress_bar import Advance, progress_bar
+from stackgen.commands.progress_bar import after, progress_bar
 from stackgen.errors import StackgenError
 from stackgen.evaluation.parallel import simulating
-from stackgen.evaluation.protocol import Scene, evaluate, load_scenes, physics_of
+from stackgen.evaluation.protocol import Scene, evaluate, load_scenes
 from stackgen.evaluation.report.charts import draw_charts
 from stackgen.evaluation.report.references import DiversityLimit, Unseen, read_diversity_limit, read_unseen
 from stackgen.evaluation.report.results import Result, result_of, run_seconds
@@ -26,7 +24,7 @@ from stackgen.evaluation.report.tables import Conditions, Report, csv_rows, term
 from stackgen.evaluation.report.tasks import Task, tasks_of
 from stackgen.evaluation.results import Evaluation, write_csv
 from stackgen.io.files import write_atomically, write_json
-from stackgen.io.provenance import code_version, machine
+from stackgen.io.provenance import code_version, cores, machine
 from stackgen.protocols import StabilityChecker
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
@@ -46,7 +44,7 @@ def main(
 ) -> None:
     """Make the paper's table with every row: collect what has been tested, run what is missing, write it down.
 
-    Each row with each block list is kept as soon as it is done: an interrupted report goes on where it
+    Each row with each block list is kept as soon as it is done: an interrupted report continues where it
     stopped, and a finished one is made again in a minute.
 
     Args:
@@ -60,20 +58,20 @@ def main(
     began, console = time.perf_counter(), Console()
     check_rows(settings.rows)
     if (limit is not None and limit < 1) or (workers is not None and workers < 1):
-        raise StackgenError("report: limit and workers must be at least 1")
+        raise StackgenError("--limit and --workers must be at least 1")
     everything, dataset = load_scenes(settings.test_set)
     scenes, manifest = everything[:limit], dataset.manifest
     physics = Physics.recorded(manifest.physics)
-    with simulating(physics, workers or os.cpu_count() or 1) as checker:
+    with simulating(physics, workers or cores()) as checker:
         conditions = Conditions(
-            (manifest.name, manifest.sha256),
-            len(scenes),
-            len(everything),
-            settings.num_samples,
-            settings.seed,
-            physics_of(checker),
-            code_version(),
-            machine(),
+            test_set=(manifest.name, manifest.sha256),
+            scenes=len(scenes),
+            all_scenes=len(everything),
+            num_samples=settings.num_samples,
+            seed=settings.seed,
+            physics=checker.physics.to_json(),
+            code=code_version(),
+            machine=machine(),
         )
         test_set = {"name": manifest.name, "sha256": manifest.sha256}
         facts = {"code": conditions.code, "machine": conditions.machine, "dataset": test_set}
@@ -122,19 +120,14 @@ def _run(
         for task in missing:
             before, began = len(answers) * len(scenes), time.perf_counter()
             try:
-                found = evaluate(task.request, scenes, checker, partial(_advance, advance, before))
+                found = evaluate(task.request, scenes, checker, after(before, advance))
                 store.keep(found, task.question)
             except KeyboardInterrupt:
                 done = f"{len(answers)} of {len(missing)} are done and kept"
-                raise KeyboardInterrupt(f"{done}: the same command goes on from there") from None
+                raise KeyboardInterrupt(f"{done}: the same command continues from there") from None
             answers[task.place] = found
             say(f"{_title(task)}: {time.perf_counter() - began:.0f} s")
     return answers
-
-
-def _advance(advance: Advance, before: int, done: int, _: int) -> None:
-    """Move the bar of all tasks together."""
-    advance(before + done)
 
 
 def _references(

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 
 from stackgen.commands.asking import arguments_of, load_both, open_run
 from stackgen.commands.parsing import Command
-from stackgen.commands.progress_bar import Advance, progress_bar
+from stackgen.commands.progress_bar import after, progress_bar
 from stackgen.errors import StackgenError
 from stackgen.evaluation.parallel import simulating
-from stackgen.evaluation.protocol import BATCH, Request, evaluate, physics_of
+from stackgen.evaluation.protocol import BATCH, Request, evaluate
 from stackgen.evaluation.report.store import PREFIX
 from stackgen.evaluation.requests import Method, question_of
 from stackgen.evaluation.results import Evaluation, write_evaluation, write_metrics, write_scenes
@@ -44,18 +43,18 @@ def main(
     `metrics.json`, a CSV of every sample and the configuration go to runs/NAME/test_N.
 
     Args:
-        subject: Who is tested.
+        subject: Method that is tested.
         config: All options, as YAML.
         ckpt_path: Checkpoint or run folder to test: of a sampler, or of a block-list network, whose lists the shipped
             sampler is then asked with.
         test_set: Dataset whose test split is asked about; by default the frozen `testset-v1`.
-        num_samples: Stacks of each scene.
-        seed: Seed of the sampler; with the batch size, the same stacks again.
+        num_samples: Number of stacks sampled for each scene.
+        seed: Seed of the sampler; the same seed and batch size give the same stacks.
         predicted_lists: Whether the network's block lists are measured too, beside the true ones.
         method: Name in the tables; by default the name of the weights.
         limit: Number of scenes to ask about, from the first; all by default.
-        batch_size: Scenes sampled at once.
-        workers: Processes that simulate.
+        batch_size: Number of scenes sampled at once.
+        workers: Number of processes that simulate.
         name: Name of the run.
         runs: Folder of all runs.
     """
@@ -71,13 +70,13 @@ def main(
     folder = open_run(name, runs, "test", config, dataset)
     found: list[Evaluation] = []
     with simulating(loaded.model.physics, workers) as checker:
-        physics = physics_of(checker)
+        physics = checker.physics.to_json()
         learnt = (loaded.model.sampler.card.get("dataset") or {}).get("physics")
         warn_of_other_physics(f"dataset {dataset.path}", manifest.physics, physics)
         warn_of_other_physics(f"what {requests[0].method} learnt from", learnt, physics)
         with progress_bar("scenes", len(requests) * len(scenes)) as (advance, _):
             for number, request in enumerate(requests):
-                found.append(evaluate(request, scenes, checker, partial(_advance, advance, number * len(scenes))))
+                found.append(evaluate(request, scenes, checker, after(number * len(scenes), advance)))
                 question = question_of(request, manifest.sha256, len(scenes), physics)
                 kind = request.block_list if request.sampler else "ground-truth"
                 write_evaluation(folder / f"{PREFIX}{kind}.json", found[-1], question)
@@ -87,11 +86,6 @@ def main(
         write_scenes(folder / f"scenes-{''.join(c if c.isalnum() else '-' for c in words)}.csv", evaluation)
     _show(found, console)
     console.print(f"wrote {folder / 'metrics.json'}", highlight=False)
-
-
-def _advance(advance: Advance, before: int, done: int, _: int) -> None:
-    """Move the bar of all requests together."""
-    advance(before + done)
 
 
 def _show(evaluations: Sequence[Evaluation], console: Console) -> None:

@@ -164,7 +164,7 @@ def evaluate(
         tuple(results),
         num_samples=request.num_samples,
         seed=request.seed,
-        physics=physics_of(checker),
+        physics=checker.physics.to_json(),
         facts=dict(request.facts),
         checking_seconds=time.perf_counter() - began - sampling,
     )
@@ -179,19 +179,31 @@ def _evaluate_batch(
         if len(truths) < len(scenes):
             raise StackgenError("ground truth needs scenes that were taken from stacks")
         return check_scenes(scenes, truths, checker, request.world), 0.0
-    silhouettes = np.stack([scene.silhouette for scene in scenes])
-    block_lists = np.stack([scene.counts for scene in scenes])
-    ranks: list[int | None] = [None] * len(scenes)
-    if request.predictor:
-        ranked = request.predictor.predict(silhouettes, top=TOP)
-        ranks = list(list_rank(ranked, block_lists).tolist())
-        block_lists = ranked[:, 0]
+    block_lists, ranks = block_lists_of(request, scenes)
     began = time.perf_counter()
-    stacks = request.sampler.sample_batch(silhouettes, block_lists, request.num_samples, seed)
+    stacks = draw(request, scenes, block_lists, seed)
     spent = time.perf_counter() - began
     each = spent / (request.num_samples * len(scenes))
     found = check_scenes(scenes, stacks, checker, request.world, block_lists=block_lists, ranks=ranks)
     return [replace(result, seconds=each) for result in found], spent
+
+
+def block_lists_of(request: Request, scenes: Sequence[Scene]) -> tuple[NDArray[np.int64], list[int | None]]:
+    """(B, S) block lists that a method is asked with, and the place of each true one among those predicted."""
+    truths = np.stack([scene.counts for scene in scenes])
+    if request.predictor is None:
+        return truths, [None] * len(scenes)
+    ranked = request.predictor.predict(np.stack([scene.silhouette for scene in scenes]), top=TOP)
+    return ranked[:, 0], list(list_rank(ranked, truths).tolist())
+
+
+def draw(
+    request: Request, scenes: Sequence[Scene], block_lists: NDArray[np.int64], seed: int
+) -> Sequence[Sequence[Stack]]:
+    """Sample the stacks of some scenes with the block lists (B, S) given."""
+    assert request.sampler is not None
+    silhouettes = np.stack([scene.silhouette for scene in scenes])
+    return request.sampler.sample_batch(silhouettes, block_lists, request.num_samples, seed)
 
 
 def check_scenes(
@@ -240,8 +252,3 @@ def check_scenes(
 def batch_seed(seed: int, number: int, rank: int = 0) -> int:
     """Give the sampler's seed for a batch (of a process, in training)."""
     return int(np.random.SeedSequence([seed, number, rank]).generate_state(1)[0])
-
-
-def physics_of(checker: StabilityChecker) -> dict[str, Any]:
-    """Give the numbers that a checker's verdicts depend on."""
-    return checker.physics.to_json()
