@@ -14,12 +14,13 @@ from rich.table import Table
 from stackgen.commands.parsing import Command, Files, epilog
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.data.card import write_card
-from stackgen.data.dataset import TESTSET, Dataset
+from stackgen.data.dataset import TESTSET, Dataset, read_manifest
 from stackgen.data.generation.executors import ExecutorName
 from stackgen.data.manifest import SPLITS, Manifest
 from stackgen.data.resplit import By, Resplit, resplit, split_table
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_json
+from stackgen.protocols import StabilityChecker
 
 EASY_TO_SEND = 64 * 2**20
 """Largest compact file that is easy to send along [byte]."""
@@ -33,7 +34,7 @@ def verify(folder: Path) -> int:
     """
     from stackgen.data.inspection.verify import verify as find_problems
 
-    manifest = Dataset.open(folder).manifest
+    manifest = read_manifest(folder)
     with progress_bar("verifying", len(manifest.shards)) as (advance, _):
         problems = find_problems(folder, advance)
     if not problems:
@@ -85,18 +86,15 @@ def info(folder: Path, out: Path | None = None, margins: int = 500, samples: int
         samples: Number of random stacks on the contact sheet; 0 for none.
         seed: Seed of both draws.
     """
-    from stackgen.data.inspection.contents import Contents, describe_margins, facts, sample_margins
+    from stackgen.data.inspection.contents import Contents, facts, sample_margins
     from stackgen.data.inspection.plots import draw_facts, draw_samples, paragraphs
     from stackgen.viz.render import save_image
 
-    if margins < 0 or samples < 0:
-        raise StackgenError("dataset info: margins and samples must be at least 0")
+    if margins < 0 or samples < 0 or seed < 0:
+        raise StackgenError("dataset info: margins, samples and seed must be at least 0")
     contents = Contents.load(folder)
-    found = facts(contents, None if folder.resolve() == TESTSET.resolve() else TESTSET)
-    held = None
-    if margins:
-        held = sample_margins(contents, _statics(contents.manifest), margins, seed)
-        found["margins"] = describe_margins(held)
+    held = sample_margins(contents, _statics(contents.manifest), margins, seed) if margins else None
+    found = facts(contents, None if folder.resolve() == TESTSET.resolve() else TESTSET, held)
     _print_facts(found)
     place = out or (folder if folder.is_dir() else None)
     if place is None:
@@ -132,7 +130,7 @@ def split(
         seed: Seed of the choice.
         out: Folder of the new dataset; without it the present split is printed.
     """
-    manifest = Dataset.open(folder).manifest
+    manifest = read_manifest(folder)
     asked = validation is not None or test is not None
     if asked != (out is not None):
         raise StackgenError("dataset split: a new split needs --out and one of --validation and --test")
@@ -169,13 +167,11 @@ def export(folder: Path, out: Path) -> None:
     print(f"wrote {out}: {sum(map(len, splits.values())):,} stacks, {size / 2**20:.1f} MiB{large}")
 
 
-def _statics(manifest: Manifest) -> Any:
-    """Statics with the friction that the dataset was made with."""
+def _statics(manifest: Manifest) -> StabilityChecker:
     from stackgen.sim.physics import Physics
     from stackgen.sim.statics.checker import StaticsChecker  # loads a solver that nothing else needs
 
-    friction = manifest.physics.get("friction", Physics().friction)
-    return StaticsChecker(Physics(friction=float(friction)))
+    return StaticsChecker(Physics.recorded(manifest.physics))
 
 
 def _print_facts(found: Mapping[str, Any]) -> None:

@@ -30,8 +30,8 @@ def main(sweep: Sweep, out: Path | None = None, parallel: int = 1, seed: int = 0
     if export_wandb:
         sys.stdout.write(sweep.to_yaml())
         return
-    if parallel < 1:
-        raise StackgenError(f"--parallel must be at least 1, got {parallel}")
+    if parallel < 1 or seed < 0:
+        raise StackgenError(f"--parallel must be at least 1 and --seed at least 0, got {parallel} and {seed}")
     require("optuna", "sweeps")
     from stackgen.training.sweeps.coordinator import JOURNAL, run_sweep, trials_wanted
     from stackgen.training.sweeps.findings import leaderboard_table, ranking, write_findings

@@ -77,8 +77,8 @@ class Dataset:
         """
         found = [Shard(self.path, entry) for entry in self.manifest.shards if entry["split"] == split]
         if not found or self.is_compact:
-            kind = "is one compact file, not shards" if self.is_compact else f"has no {split} split"
-            raise StackgenError(f"dataset {self.path} {kind}")
+            fault = "is one compact file, not shards" if self.is_compact else f"has no {split} split"
+            raise StackgenError(f"dataset {self.path} {fault}")
         return found
 
     def split(self, name: str) -> StackArrays:
@@ -105,6 +105,18 @@ class Dataset:
         """
         for shard in self.shards(split):
             yield from read_shard(shard.path, shard.sha256)
+
+
+def read_manifest(folder: Path) -> Manifest:
+    """Read the manifest of a local folder of shards.
+
+    Raises:
+        StackgenError: If there is no dataset, or it is one compact file.
+    """
+    dataset = Dataset.open(folder)
+    if dataset.is_compact:
+        raise StackgenError(f"dataset {folder} is one compact file, not a folder of shards")
+    return dataset.manifest
 
 
 def _manifest_file(root: str) -> tuple[bytes, str]:

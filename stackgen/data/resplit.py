@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from stackgen.data.card import write_card
-from stackgen.data.dataset import Dataset
+from stackgen.data.dataset import read_manifest
 from stackgen.data.generation.designs import Design
 from stackgen.data.manifest import SPLITS, Manifest, Split, split_of
 from stackgen.data.shards import Sample, read_shard, write_shard
@@ -59,7 +59,7 @@ def resplit(folder: Path, out: Path, how: Resplit, progress: Callable[[int], Non
     Raises:
         StackgenError: If there is no dataset, a shard is damaged, or `out` is there already.
     """
-    manifest = Dataset.open(folder).manifest
+    manifest = read_manifest(folder)
     if out.exists():
         raise StackgenError(f"{out} is there already: choose another folder")
     workshop = out.with_name(f".{out.name}.unfinished")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from stackgen.data.card import write_card
-from stackgen.data.dataset import Dataset
+from stackgen.data.dataset import read_manifest
 from stackgen.data.generation.executors import Executor, make_executor
 from stackgen.data.generation.generate import REVISION, GenerateSettings, ShardTask, draw, make_shards
 from stackgen.data.generation.workshop import PARTS, MadeShard, Workshop, disk_may_be_full
@@ -53,7 +53,7 @@ def repair(
         StackgenError: If there is no dataset, its settings are not known, or what is made is not what was
             written; nothing but identical shards has then been put back.
     """
-    manifest = Dataset.open(folder).manifest
+    manifest = read_manifest(folder)
     lost = {
         shard_number(entry["file"]): entry
         for entry in manifest.shards

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from stackgen.data.dataset import Dataset
+from stackgen.data.dataset import read_manifest
 from stackgen.data.manifest import Manifest, ShardEntry, shard_entry
 from stackgen.data.shards import encode_shard, is_whole, read_shard
 from stackgen.errors import StackgenError
@@ -129,7 +129,7 @@ def finished(out: Path) -> Manifest | None:
     """
     if not (out / "dataset.json").exists():
         return None
-    manifest = Dataset.open(out).manifest
+    manifest = read_manifest(out)
     lost = [entry["file"] for entry in manifest.shards if not is_whole(out / entry["file"], entry["sha256"])]
     if lost:
         more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""

@@ -70,7 +70,7 @@ class Contents:
         return self.arrays.select(np.flatnonzero(self.split == SPLITS.index(split)))
 
     def stack(self, index: int) -> Stack:
-        """One stack."""
+        """Give one stack."""
         k = int(self.arrays.lengths[index])
         return Stack(
             self.arrays.shapes[index, :k].astype(np.int64),
@@ -93,21 +93,13 @@ def _depths(dataset: Dataset) -> NDArray[np.int64]:
     return np.array(depths, np.int64)
 
 
-def facts(
-    contents: Contents,
-    testset: Path | None = None,
-    checker: StabilityChecker | None = None,
-    margins: int = 500,
-    seed: int = 0,
-) -> dict[str, Any]:
+def facts(contents: Contents, testset: Path | None = None, margins: Floats | None = None) -> dict[str, Any]:
     """Collect all facts about a dataset, as JSON allows. Shares lie in [0, 1].
 
     Args:
         contents: The dataset.
         testset: Folder of the frozen test scenes; None leaves the comparison out.
-        checker: Gives the margins; None leaves them out.
-        margins: Number of stacks whose margin is computed.
-        seed: Seed of their draw.
+        margins: Margins of some stacks [degrees], from :func:`sample_margins`; None leaves them out.
     """
     manifest = contents.manifest
     found: dict[str, Any] = {
@@ -117,8 +109,8 @@ def facts(
         "distributions": {name: describe(values) for name, values in distributions(contents).items()},
         "duplicates": duplicates(contents),
     }
-    if checker is not None:
-        found["margins"] = describe_margins(sample_margins(contents, checker, margins, seed))
+    if margins is not None:
+        found["margins"] = describe_margins(margins)
     if testset is not None:
         found["testset"] = nearness(contents, testset)
     return found

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.data.dataset import Dataset
+from stackgen.data.dataset import read_manifest
 from stackgen.data.decoding import decode_shard
 from stackgen.data.generation.workshop import PARTS, PROGRESS
 from stackgen.data.manifest import Manifest, ShardEntry
@@ -57,7 +57,7 @@ def verify(folder: Path, progress: Callable[[int], None] | None = None) -> list[
     Raises:
         StackgenError: If there is no dataset.
     """
-    manifest = Dataset.open(folder).manifest
+    manifest = read_manifest(folder)
     problems = _of_manifest(folder, manifest)
     seen = _Seen({}, {})
     for number, entry in enumerate(manifest.shards, 1):
