@@ -35,13 +35,14 @@ def main(
             without it collects them and makes what is missing.
     """
     shards = None if shard_range is None else _range(shard_range)
+    team = make_executor(executor, workers)
     what, total = (f"stacks of {settings.name}", settings.stacks) if shards is None else ("shards", len(shards))
     try:
         with progress_bar(what, total) as (advance, say):
             if shards is not None:
-                stacks = generate_range(settings, out, shards, make_executor(executor, workers), advance, say)
+                stacks = generate_range(settings, out, shards, team, progress=advance, say=say)
             else:
-                manifest = generate(settings, out, None, advance, make_executor(executor, workers), say)
+                manifest = generate(settings, out, executor=team, progress=advance, say=say)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"finished shards are kept in {out}; the same command continues from there") from None
     if shards is not None:
@@ -59,7 +60,7 @@ def _range(text: str) -> range:
     """
     match = re.fullmatch(r"(\d{1,9}):(\d{1,9})", text)
     if match is None or int(match[1]) >= int(match[2]):
-        raise StackgenError(f"generate: --shard_range {text!r} should read A:B, whole numbers with 0 <= A < B")
+        raise StackgenError(f"--shard_range {text!r} should read A:B, whole numbers with 0 <= A < B")
     return range(int(match[1]), int(match[2]))
 
 

@@ -14,7 +14,7 @@ from stackgen.sim.statics.plane import Outcome, PlaneStatics, StaticsMargins
 from stackgen.stack import Stack
 
 NEVER = StaticsMargins(enabled=False)
-"""Statics is never asked."""
+"""Margins of a settler that never asks statics."""
 
 
 @dataclass(frozen=True)
@@ -54,18 +54,18 @@ class Settler:
         limits: See AcceptLimits.
         settle_twice: Simulate the settled stack again, from a fresh start: it must stand once more, unless
             statics confirms that it does. The paper settles once; a marginal stack or two then slips in.
-        certificate: When statics may speak for the simulator; by default never.
+        margins: When statics may speak for the simulator; by default never.
     """
 
     simulator: Simulator
     limits: AcceptLimits
     settle_twice: bool
-    certificate: StaticsMargins = NEVER
+    margins: StaticsMargins = NEVER
 
     def settle(self, stack: Stack) -> Settled | None:
         """Settle a design; None if it is not accepted. Designs are not at rest, so even a sure one is simulated."""
         outcome = self._known(stack).outcome
-        sure = outcome == "stands" or not (self.certificate.enabled and self.certificate.sure_designs)
+        sure = outcome == "stands" or not (self.margins.enabled and self.margins.sure_designs)
         return self._simulated(stack) if sure and outcome != "falls" else None
 
     def settle_rest(self, rest: Settled) -> Settled | None:
@@ -89,13 +89,13 @@ class Settler:
                 continue
             if not settled.statics.holds(0.0):
                 return None
-            if settled.statics.holds(self.certificate.confirm):
+            if settled.statics.holds(self.margins.confirm):
                 break
         return settled
 
     def _known(self, stack: Stack) -> Settled:
-        friction, certificate = self.simulator.physics.friction, self.certificate
-        statics = PlaneStatics(stack, friction, certificate) if certificate.enabled else None
+        friction, margins = self.simulator.physics.friction, self.margins
+        statics = PlaneStatics(stack, friction, margins) if margins.enabled else None
         return Settled(stack, np.arange(len(stack)), statics)
 
 

@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, Literal, Protocol, TypeVar
 
-from stackgen.errors import StackgenError
+from stackgen.errors import StackgenError, require
 
 ExecutorName = Literal["local", "ray"]
 T = TypeVar("T")
@@ -215,10 +215,7 @@ class RayExecutor:
         """See :class:`Executor`."""
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # else it warns about what it will do
-        try:
-            import ray
-        except ModuleNotFoundError as error:
-            raise StackgenError("generate: --executor ray needs Ray: pip install 'stackgen[ray]'") from error
+        ray = require("ray", "ray")
         mine = not ray.is_initialized()
         if mine:
             try:

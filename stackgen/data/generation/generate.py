@@ -89,6 +89,8 @@ class GenerateSettings:
             raise StackgenError(
                 "generate: stacks, templates_per_shard and max_blocks must be at least 1, max_removals 0"
             )
+        if self.seed < 0:
+            raise StackgenError(f"generate: seed must be at least 0, got {self.seed}")
         if self.validation < 0 or self.test < 0 or self.validation + self.test > 1:
             raise StackgenError("generate: validation and test are shares of the templates; their sum is at most 1")
         if not 0 <= self.draw <= self.stacks:
@@ -143,6 +145,7 @@ _BEFORE = {"certificate": {"enabled": False}}
 def generate(
     settings: GenerateSettings,
     out: Path,
+    *,
     workers: int | None = None,
     progress: Callable[[int], None] | None = None,
     executor: Executor | None = None,
@@ -183,6 +186,7 @@ def generate_range(
     out: Path,
     shards: range,
     executor: Executor | None = None,
+    *,
     progress: Callable[[int], None] | None = None,
     say: Callable[[str], None] | None = None,
 ) -> int:

@@ -169,10 +169,10 @@ class Counting:
 
 
 def certified(simulator: Simulator | Counting, **margins: float) -> Settler:
-    return Settler(simulator, LIMITS, settle_twice=True, certificate=replace(StaticsMargins(), **margins))  # type: ignore[arg-type]
+    return Settler(simulator, LIMITS, settle_twice=True, margins=replace(StaticsMargins(), **margins))  # type: ignore[arg-type]
 
 
-def test_with_the_certificate_the_family_of_a_sure_design_is_the_same_but_for_what_has_no_margin(
+def test_with_statics_the_family_of_a_sure_design_is_the_same_but_for_what_has_no_margin(
     families: list[tuple[Stack, Family]], simulator: Simulator
 ) -> None:
     counting = Counting(simulator)

@@ -159,7 +159,7 @@ def test_ranges_of_shards_are_collected_by_a_run_without_one(
     small: Path, shards: dict[int, MadeShard], tmp_path: Path
 ) -> None:
     out, done = tmp_path / "small", list[int]()
-    held = generate_range(SMALL, out, range(3, 5), Stored(shards), done.append)
+    held = generate_range(SMALL, out, range(3, 5), Stored(shards), progress=done.append)
     assert held == shards[3].samples + shards[4].samples and done == [1, 2]
     assert not (out / "dataset.json").exists()
     assert generate_range(SMALL, out, range(0, 2), Stored(shards)) == shards[0].samples + shards[1].samples
