@@ -180,10 +180,6 @@ class StackDataModule(pl.LightningDataModule):
         """The test split once, in order."""
         return self._exact_loader("test")
 
-    def predict_dataloader(self) -> Iterable[Batch]:
-        """The test split once, in order."""
-        return self.test_dataloader()
-
     def state_dict(self) -> dict[str, Any]:
         """Say where training is, for checkpoints."""
         return {} if self._training is None else {"training": self._training.state_dict()}

@@ -5,40 +5,24 @@ Two notions of "the same", from coarse to fine. The *layout* is that of
 layer from left to right. The *design* adds the cell in which each block begins, and leaves out displacement
 and settling alone; the `layout` of a sample's metadata is one.
 
-Pure numpy, no simulator and no torch. Legend: M stacks, N blocks at most.
+Legend: M stacks, N blocks at most.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.data.arrays import PADDING
+from stackgen.data.arrays import PADDING, StackArrays
 from stackgen.data.generation.designs import cells_wide
 from stackgen.world import World
 
 _EMPTY = -1
 
 
-class PaddedStacks(Protocol):
-    """What is read of :class:`stackgen.data.arrays.StackArrays`."""
-
-    @property
-    def shapes(self) -> NDArray[np.uint8]:
-        """(M, N) indices into the catalogue, 255 after the last block."""
-        ...
-
-    @property
-    def poses(self) -> NDArray[np.float32]:
-        """(M, N, 6) [cell, rad]."""
-        ...
-
-
 def seen_layouts(
-    train: PaddedStacks,
-    test: PaddedStacks,
+    train: StackArrays,
+    test: StackArrays,
     world: World,
     *,
     positions: bool = False,
@@ -49,11 +33,11 @@ def seen_layouts(
     The defaults call a layout seen in case of doubt, so that what is called unseen is.
 
     Args:
-        train: What was trained on.
-        test: What is asked about.
+        train: Stacks that were trained on.
+        test: M stacks that are asked about.
         world: The world of both.
-        positions: Compare designs instead: also the cell in which each block begins.
-        mirror: What is the mirror image of a training stack counts as seen, as in training with `data.mirror`.
+        positions: Whether to compare designs instead: also the cell in which each block begins.
+        mirror: Whether the mirror image of a training stack counts as seen, as in training with `data.mirror`.
 
     >>> from types import SimpleNamespace
     >>> from stackgen.world import PAPER_WORLD
@@ -65,7 +49,7 @@ def seen_layouts(
     [[True], [False]]
     """
 
-    def codes(stacks: PaddedStacks, mirrored: bool = False) -> NDArray[np.int32]:
+    def codes(stacks: StackArrays, mirrored: bool = False) -> NDArray[np.int32]:
         return layout_codes(stacks, world, positions=positions, mirrored=mirrored)
 
     known = np.concatenate([codes(train), codes(train, mirrored=True)]) if mirror else codes(train)
@@ -74,14 +58,14 @@ def seen_layouts(
 
 
 def layout_codes(
-    stacks: PaddedStacks, world: World, *, positions: bool = False, mirrored: bool = False
+    stacks: StackArrays, world: World, *, positions: bool = False, mirrored: bool = False
 ) -> NDArray[np.int32]:
     """(M, N) layouts as numbers: equal rows, equal layouts.
 
     Args:
         stacks: M of them.
         world: World of the stacks.
-        positions: Add the cell in which each block begins.
+        positions: Whether to add the cell in which each block begins.
         mirrored: Whether to take the mirror images.
     """
     grid, real = world.grid, stacks.shapes != PADDING
