@@ -2,7 +2,7 @@
 
 RTDE version 2 on 30004, the dashboard on 29999, script ports on 30001 to 30003, Robotiq's socket on 63352. Instead of
 running the client's program it does what that program does: a command in an input register, done in an output register.
-Its kinematics are those of the published Denavit-Hartenberg table, not of the URDF. Every event is a line of JSON in a log.
+Its kinematics are those of the published Denavit-Hartenberg table, not of the URDF. Its log has a line for each event.
 
 Run: python tests/robot/real/standin.py --host 127.0.0.5 --log log.jsonl --joints "-15.8,-103.6,97.7,-84.1,-90,-15.8"
 """
