@@ -78,6 +78,8 @@ def main(
     """
     if sum([bool(depth), bool(sketch), bool(simulate), realsense]) != 1:
         raise StackgenError("give one of --depth FILE, --sketch PHOTO, --simulate STACKS and --realsense")
+    if seed < 0:
+        raise StackgenError(f"--seed must be at least 0, got {seed}")
     if color and not depth:
         raise StackgenError("--color belongs to --depth: give both")
     expected = None if truth is None else read_silhouette(truth, PAPER_GRID)

@@ -196,13 +196,12 @@ class Workcell:
     workspace: Workspace = field(default_factory=Workspace)
 
     def __post_init__(self) -> None:
-        for group in (self.jaws, self.staging, self.speeds, self.workspace):
-            for name, value in vars(group).items():
-                numbers = np.asarray(value, dtype=float).ravel()
-                if not np.isfinite(numbers).all():
-                    raise StackgenError(f"cell: {name} must be finite, got {value}")
-                if isinstance(value, float) and value <= 0:
-                    raise StackgenError(f"cell: {name} must be positive, got {value:g}")
+        groups = (self.base, self.jaws, self.staging, self.speeds, self.workspace)
+        for name, value in [("home", self.home), *(item for group in groups for item in vars(group).items())]:
+            if not np.isfinite(np.asarray(value, dtype=float)).all():
+                raise StackgenError(f"cell: {name} must be finite, got {value}")
+            if isinstance(value, float) and value <= 0 and name != "yaw":
+                raise StackgenError(f"cell: {name} must be positive, got {value:g}")
         if not self.staging.slots:
             raise StackgenError("cell: staging.slots is empty: name the middle of at least one slot")
         if not all(low < high for low, high in zip(self.workspace.low, self.workspace.high, strict=True)):

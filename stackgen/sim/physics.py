@@ -6,11 +6,15 @@ carries them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
+from stackgen.errors import StackgenError
+
+_MAY_BE_ZERO = ("friction", "gravity", "solver_residual", "contact_threshold", "rest_motion")
 _TAKEN_OVER = ("cell_size", "friction", "density", "gravity", "fall_height")
 
 
@@ -33,6 +37,9 @@ class Physics:
         rest_motion: Largest motion of a block at rest [cell].
         fall_height: Drop of its centre from which on a block fell [cell] (paper: "to a layer below where it
             began", here half a cell).
+
+    Raises:
+        StackgenError: If a number makes no sense.
     """
 
     cell_size: float = 0.05
@@ -47,6 +54,13 @@ class Physics:
     rest_window: float = 0.0625
     rest_motion: float = 5e-4
     fall_height: float = 0.5
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            least = "at least 0" if name in _MAY_BE_ZERO else "positive"
+            fine = isinstance(value, int | float) and 0 <= value < math.inf and (value or name in _MAY_BE_ZERO)
+            if not fine:
+                raise StackgenError(f"physics: {name} must be {least} and finite, got {value!r}")
 
     @staticmethod
     def recorded(made: Mapping[str, Any] | None, given: Physics | None = None) -> Physics:

@@ -73,7 +73,8 @@ class DepthFrame:
         center: (column, row) of the optical axis [pixel]; None for the middle.
 
     Raises:
-        StackgenError: If there is no depth in it, or the colour picture has another size.
+        StackgenError: If there is no depth in it, the colour picture has another size, or the focal length is not
+            positive.
     """
 
     depth: Floats
@@ -96,6 +97,8 @@ class DepthFrame:
                 f"the colour picture is {self.colour.shape[1]} x {self.colour.shape[0]} pixels and the depth"
                 f" {depth.shape[1]} x {depth.shape[0]}; align one to the other when recording"
             )
+        if self.focal is not None and not 0 < self.focal < np.inf:
+            raise StackgenError(f"the focal length must be positive, got {self.focal:g}")
         object.__setattr__(self, "depth", depth)
 
     @property

@@ -38,6 +38,8 @@ def test_a_simulated_capture_tells_its_iou(tmp_path: Path, capsys: pytest.Captur
         (["--depth", "words.npy"], "words.npy: cannot be read"),
         (["--depth", "empty.png"], "empty.png: is no depth frame"),
         (["--depth", "wall.npy"], "nothing stands in front of the background"),
+        (["--depth", "wall.npy", "--focal", "0"], "wall.npy: the focal length must be positive"),
+        (["--realsense", "--seed", "-1"], "--seed must be at least 0"),
         (["--realsense"], "RealSense"),
         (["--sketch", "no.jpg", "--realsense"], "give one of"),
     ],

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
 from stackgen.data.generation.designs import draw_design, realize
+from stackgen.errors import StackgenError
 from stackgen.protocols import StabilityChecker
 from stackgen.sim.checkers import AcceptLimits, SimulatorChecker, accept, fell
 from stackgen.sim.physics import Physics, engine_version
@@ -124,3 +126,13 @@ def test_the_physics_travel_with_the_engine_s_name() -> None:
     plain = Physics(friction=0.7).to_json()
     assert plain.pop("engine") == engine_version() and engine_version().startswith("pybullet ")
     assert Physics(**plain) == Physics(friction=0.7)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("friction", -0.1), ("time_step", 0.0), ("density", -1.0), ("watch", float("inf")), ("gravity", "low")],
+)
+def test_numbers_that_make_no_sense_are_refused(name: str, value: float) -> None:
+    with pytest.raises(StackgenError, match=f"physics: {name} must be"):
+        Physics(**{name: value})
+    assert Physics(friction=0, gravity=0, rest_motion=0).friction == 0

@@ -13,7 +13,7 @@ import pytest
 from stackgen.errors import StackgenError
 from stackgen.geometry import block_vertices
 from stackgen.robot.planning.staging import lay_out, make_room, push_path
-from stackgen.robot.workcell import Jaws, Staging, Workcell
+from stackgen.robot.workcell import Base, Jaws, Staging, Workcell
 from stackgen.stack import Stack
 from stackgen.world import PAPER_CATALOGUE
 
@@ -73,6 +73,12 @@ def test_what_does_not_fit_is_refused() -> None:
     assert "too small: 2 blocks, but 1 slots" in refused(row(0, 2), FEW)
     assert "too small: block 0 (rectangle)" in refused(stack_of([1], [[0, 0, 0.5, 0, 0, 0]]), short)
     assert "leans more than 20 degrees" in refused(lying, WORKCELL)
+
+
+def test_a_workcell_of_numbers_that_make_no_sense_is_refused() -> None:
+    for change in ({"base": Base(yaw=np.nan)}, {"home": (np.inf,) * 6}, {"jaws": replace(Jaws(), force=0.0)}):
+        with pytest.raises(StackgenError, match=r"cell: (yaw|home|force) must be"):
+            Workcell(**change)
 
 
 def gaps(stack: Stack) -> list[float]:
