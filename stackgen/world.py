@@ -200,14 +200,7 @@ class Catalogue:
             StackgenError: If an entry is malformed.
         """
         try:
-            return Catalogue(
-                tuple(
-                    Shape(
-                        str(i["name"]), tuple((float(x), float(z)) for x, z in i["outline"]), float(i.get("depth", 1))
-                    )
-                    for i in items
-                )
-            )
+            return Catalogue(tuple(_prism(str(item["name"]), item) for item in items))
         except (KeyError, TypeError, ValueError) as error:
             raise StackgenError(
                 f'a catalogue is a list of {{"name", "outline": [[x, z], ...], "depth"}}: {error!r}'
@@ -249,9 +242,13 @@ def _shape_from_config(item: str | Mapping) -> Shape:
             if not all(0 < extent < np.inf for extent in extents):
                 raise StackgenError(f"shape {name!r}: width, height and depth must be positive and finite")
             return Shape.box(name, *extents)
-        return Shape(name, tuple((float(x), float(z)) for x, z in item["outline"]), float(item.get("depth", 1)))
+        return _prism(name, item)
     except (TypeError, ValueError) as error:
         raise StackgenError(f"shape {name!r}: extents are numbers, an outline [[x, z], ...]: {error}") from error
+
+
+def _prism(name: str, item: Mapping) -> Shape:
+    return Shape(name, tuple((float(x), float(z)) for x, z in item["outline"]), float(item.get("depth", 1)))
 
 
 def _short(value: object) -> str:
@@ -267,7 +264,7 @@ PAPER_CATALOGUE = Catalogue(
         Shape("triangle", ((-0.5, -0.5), (0.5, -0.5), (0.0, 0.5))),
     )
 )
-"""The four shapes of the paper; SPEC: the long rectangle is three cells, the triangle one cell, apex up."""
+"""The four shapes of the paper: the long rectangle has three cells, the triangle one, apex up."""
 
 
 ROOM = 0.2

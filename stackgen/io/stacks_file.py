@@ -26,8 +26,6 @@ from stackgen.world import PAPER_WORLD, Catalogue, Grid, Mask, World
 
 FORMAT = "stackgen.stacks/1"
 SCHEMA_PATH = Path(__file__).with_name("stacks.schema.json")
-MAX_BLOCKS_READ = 1000
-"""Blocks that a stack in a file may have, as the schema says; a model's own limit is its world's `max_blocks`."""
 
 
 @dataclass(frozen=True)

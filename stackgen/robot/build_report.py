@@ -132,10 +132,6 @@ class BuildReport:
         """All contacts that should not have been."""
         return tuple(contact for block in self.blocks for contact in block.unplanned)
 
-    def errors(self, key: str, when: str = "settled") -> Floats:
-        """One of the placement errors (k,), without its sign: `xy`, `z`, `yaw`, `tilt`; `released` or `settled`."""
-        return np.abs([getattr(getattr(block, when), key) for block in self.blocks])
-
     def to_json(self) -> dict[str, Any]:
         """Plain form; the stacks as `stacks.json` has them."""
         plain = {k: v for k, v in vars(self).items() if k not in ("stack", "design", "blocks")}

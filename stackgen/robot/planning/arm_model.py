@@ -28,7 +28,6 @@ class ArmModel:
 
     def __init__(self, arm: ArmDescription) -> None:
         self.pinocchio: Any = require("pinocchio", "robot")
-        self.description = arm
         text = ElementTree.tostring(chain_urdf(arm), encoding="unicode")
         try:
             self.model = self.pinocchio.buildModelFromXML(text)

@@ -33,7 +33,6 @@ Floats = NDArray[np.float64]
 
 PORT = 30004
 _RATE = 50.0  # states a second that are looked at
-_CONTROL_RATE = 125.0  # that the client's own handshake goes by; all UR controllers keep up with it
 _VARIABLES = (
     "timestamp",
     "actual_q",

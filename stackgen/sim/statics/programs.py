@@ -257,12 +257,12 @@ def _solver(matrix: Floats, cost: Floats, rhs: Floats, free: int = 0, inequaliti
     lower[:free] = -np.inf
     row_upper = rhs.copy()
     row_upper[rows - inequalities :] = np.inf
-    layout, sense = int(highspy.MatrixFormat.kColwise), int(highspy.ObjSense.kMinimize)
+    columnwise, least = int(highspy.MatrixFormat.kColwise), int(highspy.ObjSense.kMinimize)
     solver = highspy.Highs()
     for option, choice in _OPTIONS.items():
         solver.setOptionValue(option, choice)
     solver.passModel(
-        *(n, rows, len(row), layout, sense, 0.0, cost, lower, upper, rhs, row_upper),
+        *(n, rows, len(row), columnwise, least, 0.0, cost, lower, upper, rhs, row_upper),
         *(starts, row.astype(np.int32), matrix[row, column], np.zeros(n, dtype=np.int32)),
     )
     return solver
