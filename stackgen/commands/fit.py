@@ -122,11 +122,14 @@ class StackgenCLI(LightningCLI):
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
-        """The verbs, and which of their arguments are not options."""
+        """List the verbs, and which of their arguments are not options."""
         return {verb: skip for verb, skip in LightningCLI.subcommands().items() if verb in EXAMPLES}
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         """Add what Lightning does not have: the run's name and its dashboard."""
+        for group in parser._action_groups:
+            if "LightningModule" in (group.title or ""):
+                group.title = "Model"
         parser.add_argument(
             "--name",
             type=str,
@@ -256,7 +259,7 @@ def _complete(callbacks: list[Callback], checkpoints: Path | None) -> list[Callb
 
 
 def _simulator(data: StackDataModule) -> StabilityChecker | None:
-    """The simulator of the data's physics, where it is installed: training does without it."""
+    """Make a simulator with the data's physics, where it is installed: training does without it."""
     try:
         from stackgen.sim.checkers import SimulatorChecker
     except ModuleNotFoundError:
