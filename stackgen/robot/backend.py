@@ -55,17 +55,13 @@ class ArmBackend(Protocol):
         ...
 
 
-def _ignore(step: BlockPlan) -> None:
-    """Do nothing about a block."""
-
-
 def execute(
     plan: BuildPlan,
     arm: ArmBackend,
     *,
-    on_start: Callable[[BlockPlan], None] = _ignore,
-    on_release: Callable[[BlockPlan], None] = _ignore,
-    on_done: Callable[[BlockPlan], None] = _ignore,
+    on_start: Callable[[BlockPlan], None] = lambda step: None,
+    on_release: Callable[[BlockPlan], None] = lambda step: None,
+    on_done: Callable[[BlockPlan], None] = lambda step: None,
 ) -> None:
     """Have an arm carry out a plan.
 

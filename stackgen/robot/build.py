@@ -147,59 +147,11 @@ def build(
         on_block: Called with the number of blocks that are placed.
         camera: Camera that films it.
     """
-    outcome = _simulate(planned, grasp=grasp, noise=noise, window=window, on_block=on_block, camera=camera)
-    order, physics, built = planned.design.order, planned.physics, outcome.stack
-    moved = np.linalg.norm(built.poses[:, :3] - planned.plan.stack.poses[:, :3], axis=1)
-    verdict, generated = _verdict(built, physics), planned.design.generated  # awake, in a fresh world
-    return BuildReport(
-        blocks=outcome.blocks,
-        order=planned.design.strategy,
-        safe=order.safe,
-        least_margin=order.least_margin,
-        grasp=grasp,
-        built=bool((moved < physics.fall_height).all()),
-        stands=verdict.stable,
-        iou_target=None if target is None else silhouette_iou(verdict.settled, target, grid) * verdict.stable,
-        iou_generated=iou(silhouette(verdict.settled, grid), silhouette(generated, grid)),
-        generated_iou_target=None if target is None else silhouette_iou(generated, target, grid),
-        seconds=outcome.seconds,
-        real_time_factor=outcome.seconds / outcome.wall_seconds,
-        tracking_error=outcome.tracking_error,
-        torque=outcome.torque,
-        stack=built,
-        design=planned.plan.stack,
-    )
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Outcome:
-    """What the simulation of a build left: the fields of the report that are read from it."""
-
-    stack: Stack
-    blocks: tuple[BlockReport, ...]
-    seconds: float
-    wall_seconds: float
-    tracking_error: float
-    torque: tuple[float, ...]
-
-
-def _simulate(
-    planned: PlannedBuild,
-    *,
-    grasp: Grasp,
-    noise: PickNoise,
-    window: bool,
-    on_block: Callable[[int], None],
-    camera: Camera,
-) -> _Outcome:
-    """Carry out a plan on the simulated arm and wait until all is at rest."""
-    plan, begin = planned.plan, time.perf_counter()
+    plan, order, physics, began = planned.plan, planned.design.order, planned.physics, time.perf_counter()
     frames = {step.block: step.waiting.frame for step in plan.blocks}
     believed = [frames[block] for block in range(len(plan.stack))]
-    with ExitStack() as opened:
-        arm = opened.enter_context(
-            SimulatedArm(planned.workcell, plan.stack, noise.disturb(believed), planned.physics, grasp=grasp)
-        )
+    disturbed = noise.disturb(believed)
+    with SimulatedArm(planned.workcell, plan.stack, disturbed, physics, grasp=grasp) as arm, ExitStack() as opened:
         view = opened.enter_context(Window(arm)).step if window else lambda: None
         slots = [PlacementError.between(arm.frame(block), believed[block]) for block in range(len(plan.stack))]
         film, watch = camera(arm), _Watch(arm, on_block)
@@ -213,16 +165,29 @@ def _simulate(
         execute(plan, arm, on_start=watch.start, on_release=watch.release, on_done=watch.done)
         arm.wait(_REST)
         watch.end()
-        seconds, wall = arm.time, time.perf_counter() - begin
+        seconds, wall_seconds = arm.time, time.perf_counter() - began
         film(True)
-        return _Outcome(
-            stack=arm.built(),
-            blocks=tuple(watch.report(step, slots[step.block]) for step in plan.blocks),
-            seconds=seconds,
-            wall_seconds=wall,
-            tracking_error=float(np.degrees(arm.tracking_error)),
-            torque=tuple(np.round(arm.torque, 1).tolist()),
-        )
+        blocks, built = tuple(watch.report(step, slots[step.block]) for step in plan.blocks), arm.built()
+    moved = np.linalg.norm(built.poses[:, :3] - plan.stack.poses[:, :3], axis=1)
+    verdict, generated = _verdict(built, physics), planned.design.generated  # awake, in a fresh world
+    return BuildReport(
+        blocks=blocks,
+        order=planned.design.strategy,
+        safe=order.safe,
+        least_margin=order.least_margin,
+        grasp=grasp,
+        built=bool((moved < physics.fall_height).all()),
+        stands=verdict.stable,
+        iou_target=None if target is None else silhouette_iou(verdict.settled, target, grid) * verdict.stable,
+        iou_generated=iou(silhouette(verdict.settled, grid), silhouette(generated, grid)),
+        generated_iou_target=None if target is None else silhouette_iou(generated, target, grid),
+        seconds=seconds,
+        real_time_factor=seconds / wall_seconds,
+        tracking_error=float(np.degrees(arm.tracking_error)),
+        torque=tuple(np.round(arm.torque, 1).tolist()),
+        stack=built,
+        design=plan.stack,
+    )
 
 
 @dataclass
