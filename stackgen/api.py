@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -81,19 +81,19 @@ class Model:
         blocks: BlockList | None = None,
         inventory: Inventory | None = None,
     ) -> list[Stack]:
-        """Stacks whose front silhouette should match; same seed, same stacks.
+        """Sample stacks whose front silhouette should match; the same seed gives the same stacks.
 
         Args:
             silhouette: Image file or array, of any size and either polarity.
             num_samples: Number of stacks.
             seed: Seed of the samples.
             blocks: The block list; the network's most likely one by default.
-            inventory: The blocks there are, in the same forms: the block list is then the most likely of
-                those they allow.
+            inventory: Blocks that are available, in the same forms; the block list is then the most likely one that
+                they allow.
 
         Raises:
-            StackgenError: If there is nothing to see in the image, or the block list is not possible, or
-                none is with that inventory.
+            StackgenError: If there is nothing to see in the image, the block list is not possible, or the inventory
+                allows none.
         """
         mask, lists = self._scene(silhouette, blocks, inventory)
         return self._draw(mask, lists[0], num_samples, seed)
@@ -107,14 +107,14 @@ class Model:
         on_step: Callable[[], None] = lambda: None,
         inventory: Inventory | None = None,
     ) -> StacksFile:
-        """The stacks of :meth:`sample` with all that is known of them, as `stacks.json` holds it.
+        """Sample as :meth:`sample` does, and check each stack.
 
         Args:
-            silhouette, num_samples, seed, blocks, inventory: As there.
+            silhouette, num_samples, seed, blocks, inventory: As in :meth:`sample`.
             on_step: Called `num_samples + 1` times: once the poses are there, and after each verdict.
 
         Returns:
-            Target, block list, and for each stack the simulator's verdict and the front IoU.
+            What `stacks.json` holds: target, block list, and for each stack the checker's verdict and the front IoU.
         """
         mask, lists = self._scene(silhouette, blocks, inventory)
         stacks = self._draw(mask, lists[0], num_samples, seed)
@@ -123,7 +123,8 @@ class Model:
         for stack in stacks:
             entries.append(check(self.checker, stack, mask, self.world.grid))
             on_step()
-        file = self._file(tuple(entries), silhouette, mask, lists[0], blocks is None, seed, inventory)
+        asked: dict[str, Any] = {"silhouette": silhouette, "seed": seed, "blocks": blocks, "inventory": inventory}
+        file = self._file(entries, mask, lists[0], **asked)
         return replace(file, sampler=dict(self.sampler.settings))
 
     def sample_verified(
@@ -169,46 +170,48 @@ class Model:
                 entry = check(self.checker, found.stack, mask, self.world.grid)
             entries.append(replace(entry, comment="" if found.verdict.stable else "nothing stable was found for it"))
             on_step()
-        file = self._file(tuple(entries), silhouette, mask, counts, blocks is None, seed, inventory)
+        asked: dict[str, Any] = {"silhouette": silhouette, "seed": seed, "blocks": blocks, "inventory": inventory}
+        file = self._file(entries, mask, counts, **asked)
         comment = f"verified by {verify}: {choice.drawn} stacks drawn, {choice.checked} checked, {choice.stable} stable"
         comment += f", {tried} block lists tried" if tried > 1 else ""
         return replace(file, sampler=sampler.settings, comment=comment)
 
     def _file(
         self,
-        entries: tuple[StackEntry, ...],
-        silhouette: Silhouette,
+        entries: Sequence[StackEntry],
         mask: Mask,
-        counts: NDArray[np.int64],
-        chosen: bool,
+        block_list: NDArray[np.int64],
+        *,
+        silhouette: Silhouette,
         seed: int,
+        blocks: BlockList | None,
         inventory: Inventory | None,
     ) -> StacksFile:
-        physics = getattr(self.checker, "physics", None)
+        physics = self.checker.physics
         return StacksFile(
-            entries,
+            tuple(entries),
             self.world,
             target=mask,
             silhouette=Path(silhouette).name if isinstance(silhouette, str | Path) else None,
-            block_list=counts,
-            block_list_source="cnn" if chosen else "given",
+            block_list=block_list,
+            block_list_source="cnn" if blocks is None else "given",
             inventory=None if inventory is None else self.inventory(inventory),
-            physics=physics.to_json() if physics else None,
+            physics=physics.to_json(),
             seed=seed,
             weights=self.weights,
-            cell_size=physics.cell_size if physics else StacksFile.cell_size,
+            cell_size=physics.cell_size,
         )
 
     def read(self, silhouette: Silhouette) -> Mask:
-        """The (H, W) silhouette in an image, scaled and placed as the model knows them."""
+        """Read the (H, W) silhouette in an image, scaled and placed as the model knows them."""
         return read_silhouette(silhouette, self.world.grid)
 
     def predict_blocks(self, silhouette: Silhouette, inventory: Inventory | None = None) -> NDArray[np.int64]:
-        """(S,) the network's most likely block list for a silhouette, of those that an inventory allows."""
+        """Predict the most likely block list (S,) of a silhouette, of those that an inventory allows."""
         return self._scene(silhouette, None, inventory)[1][0]
 
     def inventory(self, inventory: Inventory) -> NDArray[np.int64]:
-        """(S,) counts of an inventory in any of its forms.
+        """Count the blocks (S,) of an inventory in any of its forms.
 
         Raises:
             StackgenError: On an unknown shape, a negative number, or no block at all.
@@ -218,7 +221,7 @@ class Model:
         return inventory_counts(inventory, self.world.catalogue)
 
     def counts(self, blocks: BlockList) -> NDArray[np.int64]:
-        """(S,) counts of a block list in any of its forms.
+        """Count the blocks (S,) of a block list in any of its forms.
 
         Raises:
             StackgenError: On an unknown shape, a negative or too large number of blocks.
@@ -241,7 +244,7 @@ class Model:
     def _scene(
         self, silhouette: Silhouette, blocks: BlockList | None, inventory: Inventory | None = None, top: int = 1
     ) -> tuple[Mask, NDArray[np.int64]]:
-        """Target (H, W) and block lists (T, S), at most `top`, the most likely first; one if it was given."""
+        """Read the target (H, W); choose block lists (T, S), at most `top`, the most likely first, or the one given."""
         if blocks is not None and inventory is not None:
             raise StackgenError("give a block list or an inventory to choose it from, not both")
         mask = self.read(silhouette)
@@ -256,9 +259,8 @@ class Model:
         try:
             return mask, allowed_lists(aligned, self.inventory(inventory), self.world, ranks, top)
         except StackgenError as error:
-            raise StackgenError(
-                f"{silhouette}: {error}" if isinstance(silhouette, str | Path) else str(error)
-            ) from error
+            name = f"{silhouette}: " if isinstance(silhouette, str | Path) else ""
+            raise StackgenError(f"{name}{error}") from error
 
     @staticmethod
     def _check_draw(num_samples: int, seed: int) -> None:
@@ -273,7 +275,7 @@ class Model:
 
     @cached_property
     def predictor(self) -> BlockListPredictor:
-        """What proposes block lists.
+        """The network, or other predictor, that proposes block lists.
 
         Raises:
             StackgenError: If the model was made without one.
@@ -284,7 +286,7 @@ class Model:
 
     @cached_property
     def checker(self) -> StabilityChecker:
-        """What says which stacks stand."""
+        """The checker that says which stacks stand."""
         if self._checker is not None:
             return self._checker
         from stackgen.sim.checkers import SimulatorChecker  # training machines have no PyBullet
@@ -293,7 +295,7 @@ class Model:
 
     @property
     def physics(self) -> Physics:
-        """Of the world that the sampler was trained in."""
+        """Physics of the dataset that the sampler was trained on; the project's own where that is not known."""
         from stackgen.sim.physics import Physics
 
         dataset = self.sampler.card.get("dataset") or {}
@@ -313,15 +315,15 @@ def load(
     block_list_weights: str | Path = DEFAULT,
     sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
 ) -> Model:
-    """A model from weights.
+    """Load a model from weights.
 
     Args:
         weights: Weights of the sampler: a name in the package (of weights, or of a heuristic such as
             `brute-force`), a `.safetensors` file, a `.ckpt` of our training, or the folder of a run; or
             a sampler itself.
-        block_list_weights: Weights of the block-list network: a name, a file or a folder, as before; they are
-            read when they are first needed.
-        sampler: Settings by which a diffusion model samples, where they are not as its weights have them.
+        block_list_weights: Weights of the block-list network: a name in the package, a `.safetensors` file, a `.ckpt`
+            of our training, or the folder of a run; they are read when they are first needed.
+        sampler: Settings by which a diffusion model samples; what is null is as its weights have it.
 
     Raises:
         StackgenError: If there are no such weights, or they are not ours.
@@ -344,7 +346,7 @@ def load(
 
 
 def _sampler(weights: str | Path | StackSampler, settings: SamplerConfig) -> tuple[StackSampler, Weights | None]:
-    """The sampler, and the name and the hash of its weights (a heuristic's: of its settings)."""
+    """Load the sampler; give the name and the hash of its weights too (a heuristic's: of its settings)."""
     from stackgen.sampling.methods import load_sampler
 
     loaded = load_sampler(weights) if isinstance(weights, str | Path) else weights
@@ -359,7 +361,7 @@ def _sampler(weights: str | Path | StackSampler, settings: SamplerConfig) -> tup
 
 
 def _configured(loaded: StackSampler, weights: str, settings: SamplerConfig) -> StackSampler:
-    """The sampler with settings, if any are given."""
+    """Give the sampler these settings, if there are any."""
     if settings == SamplerConfig():
         return loaded
     if not hasattr(loaded, "configured"):
@@ -374,5 +376,5 @@ def sample(
     blocks: BlockList | None = None,
     weights: str | Path = DEFAULT,
 ) -> list[Stack]:
-    """`load(weights).sample(...)` in one call; keep a model where you sample more than once."""
+    """Call `load(weights).sample(...)`; keep a model instead where you sample more than once."""
     return load(weights).sample(silhouette, num_samples, seed, blocks)
