@@ -86,7 +86,7 @@ class StackArrays:
         return np.stack([np.count_nonzero(self.shapes == s, axis=1) for s in range(self.num_shapes)], axis=1)
 
     def images(self, indices: ArrayLike | slice = slice(None)) -> NDArray[np.bool_]:
-        """(B, H, W) front silhouettes of some stacks."""
+        """Unpack the front silhouettes (B, H, W) of some stacks."""
         packed = self.silhouettes[indices if isinstance(indices, slice) else np.asarray(indices)]
         return np.unpackbits(packed, axis=1).view(bool).reshape(-1, self.image_size, self.image_size)
 
@@ -96,7 +96,7 @@ class StackArrays:
         return StackArrays(self.shapes[i], self.poses[i], self.silhouettes[i], self.template[i], self.num_shapes)
 
     def pose_statistics(self, mirror: bool = False) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Mean (6,) and standard deviation (6,) of the poses of all blocks [cell, rad].
+        """Compute mean (6,) and standard deviation (6,) of the poses of all blocks [cell, rad].
 
         Args:
             mirror: Whether to count their mirror images as well.
@@ -117,7 +117,7 @@ class StackArrays:
 
     @staticmethod
     def concatenate(parts: Sequence[StackArrays]) -> StackArrays:
-        """Several as one, in the order given; at least one."""
+        """Put several together, at least one, in the order given."""
         if len(parts) == 1:
             return parts[0]
         fields = {name: np.concatenate([getattr(part, name) for part in parts]) for name in FIELDS}
@@ -159,7 +159,7 @@ class Buffers:
         self._kept: deque[NDArray[np.float32]] = deque()
 
     def take(self, size: int) -> Tensor:
-        """(size,) float32 of any content."""
+        """Give (size,) float32 of any content."""
         for _ in range(len(self._kept)):
             buffer = self._kept.popleft()
             free = sys.getrefcount(buffer) == 2  # by this name and as the argument; a tensor's storage is a third
@@ -204,7 +204,7 @@ class StackTensors:
 
     @staticmethod
     def of(arrays: StackArrays, buffers: Buffers | None = None) -> StackTensors:
-        """Tensors that share the arrays' memory."""
+        """Make tensors that share the arrays' memory."""
         parts = {
             "shapes": arrays.shapes.view(np.int8),
             "poses": arrays.poses,
@@ -253,7 +253,7 @@ class StackTensors:
         }
 
     def _unpack(self, packed: Tensor) -> Tensor:
-        """(B, H, W / 8) bytes to (B, H, W) float32."""
+        """Unpack (B, H, W / 8) bytes to (B, H, W) float32."""
         if packed.device.type == "cpu":
             out = self.buffers.take(8 * packed.numel()).view(-1, 8)
         else:

@@ -115,7 +115,7 @@ def _making(manifest: Manifest) -> str:
         f"until at least {fill} of {width} cells are occupied; each block is shifted along x within "
         f"{shift:g} cell. The design is simulated{twice} and kept if it comes to rest, no block moved by more than "
         f"{accept['displacement']:g} cell along an axis or leaned by more than {accept['tilt']:g} rad. From what "
-        f"stands, up to {s['max_removals']} blocks are removed one at a time, and each rest is judged in the same way."
+        f"stands, up to {s['max_removals']} blocks are removed one at a time, and each rest is checked in the same way."
     ]
     if s.get("draw"):
         lines.append(f"Of {s['stacks']:,} stacks made so, {s['draw']:,} were drawn uniformly without replacement.")

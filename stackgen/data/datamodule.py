@@ -102,7 +102,7 @@ class StackDataModule(pl.LightningDataModule):
         return self.dataset.world
 
     def pose_statistics(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Mean (6,) and standard deviation (6,) of the training poses; when streaming, of a few shards'."""
+        """Compute mean (6,) and standard deviation (6,) of the training poses; when streaming, of a few shards'."""
         if self.is_cached("train"):
             return self.split("train").pose_statistics(self.mirror)
         shards, log = self.dataset.shards("train"), SkipLog()
@@ -117,7 +117,7 @@ class StackDataModule(pl.LightningDataModule):
         return arrays.pose_statistics(self.mirror)
 
     def is_cached(self, split: Split) -> bool:
-        """Whether a split is held in memory; the same on every process and machine."""
+        """Tell whether a split is held in memory; the same on every process and machine."""
         dataset = self._of(split)
         if self.mode == "cached" or dataset.is_compact:
             return True
@@ -148,7 +148,7 @@ class StackDataModule(pl.LightningDataModule):
         return self._of(name).split(name)
 
     def train_dataloader(self) -> Epochs:
-        """Shuffled batches."""
+        """Make the loader of shuffled batches."""
         options: dict[str, Any] = {
             "bucket_by_blocks": self.bucket_by_blocks,
             "mirror": self.mirror,
@@ -173,11 +173,11 @@ class StackDataModule(pl.LightningDataModule):
         return self._training
 
     def val_dataloader(self) -> Iterable[Batch]:
-        """The validation split once, in order."""
+        """Make a loader of the validation split, once, in order."""
         return self._exact_loader("validation")
 
     def test_dataloader(self) -> Iterable[Batch]:
-        """The test split once, in order."""
+        """Make a loader of the test split, once, in order."""
         return self._exact_loader("test")
 
     def state_dict(self) -> dict[str, Any]:
@@ -189,7 +189,7 @@ class StackDataModule(pl.LightningDataModule):
         self._resume = state.get("training")
 
     def _in_hand(self) -> bool:
-        """Whether training stopped in the middle of a step, as by Ctrl-C.
+        """Tell whether training stopped in the middle of a step, as by Ctrl-C.
 
         Lightning does not say so itself; these parts of its loop are pinned by a test.
         """
@@ -223,6 +223,6 @@ class StackDataModule(pl.LightningDataModule):
 
 
 def _is_symmetric(outline: Iterable[tuple[float, float]]) -> bool:
-    """Whether an outline's corners are their own mirror image at x = 0."""
+    """Tell whether an outline's corners are their own mirror image at x = 0."""
     corners = {(round(x, 6) + 0.0, round(z, 6) + 0.0) for x, z in outline}
     return corners == {(-x + 0.0, z) for x, z in corners}

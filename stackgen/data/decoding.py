@@ -35,7 +35,7 @@ _POSE = 6
 
 
 def bytes_per_sample(world: World) -> int:
-    """Memory that a stack takes in :class:`StackArrays`, its cached block list and length included [byte]."""
+    """Compute the memory of a stack in :class:`StackArrays`, its cached block list and length included [byte]."""
     pixels = world.grid.image_size**2
     return world.max_blocks * (1 + 4 * _POSE) + pixels // 8 + 8 * (len(world.catalogue) + 2)
 
@@ -81,7 +81,7 @@ _Row = tuple[bytes, bytes, bytes, int]
 
 
 def _assemble(rows: list[_Row], world: World) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
-    """Which slots hold blocks, and the arrays of some rows."""
+    """Say which slots hold blocks, and make the arrays of some rows."""
     shapes, poses, silhouettes, template = zip(*rows, strict=True) if rows else ((), (), (), ())
     m, n = len(rows), world.max_blocks
     real = np.arange(n) < np.array([len(part) for part in shapes], np.int64)[:, None]
@@ -93,7 +93,7 @@ def _assemble(rows: list[_Row], world: World) -> tuple[NDArray, NDArray, NDArray
 
 
 def _row(content: bytes, members: dict[bytes, slice], world: World) -> _Row:
-    """One sample.
+    """Read one sample.
 
     Raises:
         Exception: If a part is missing or not what the format says.
@@ -114,7 +114,7 @@ def _row(content: bytes, members: dict[bytes, slice], world: World) -> _Row:
 
 
 def _npy(content: bytes, kind: np.dtype) -> tuple[tuple[int, ...], bytes]:
-    """Shape and plain bytes of an array of numpy's format."""
+    """Read shape and plain bytes of an array of numpy's format."""
     start = 10 + int.from_bytes(content[8:10], "little")
     shape, found = _npy_header(content[:start])
     expected = kind.itemsize
@@ -136,7 +136,7 @@ def _npy_header(header: bytes) -> tuple[tuple[int, ...], np.dtype]:
 
 
 def _samples(content: bytes) -> Iterator[tuple[str, dict[bytes, slice]]]:
-    """Key and members of each sample: neighbours that share the part of their name before the first dot."""
+    """Find key and members of each sample: neighbours that share the part of their name before the first dot."""
     key, members = b"", dict[bytes, slice]()
     for name, place in _members(content):
         here, _, suffix = name.partition(b".")
@@ -150,7 +150,7 @@ def _samples(content: bytes) -> Iterator[tuple[str, dict[bytes, slice]]]:
 
 
 def _members(content: bytes) -> Iterator[tuple[bytes, slice]]:
-    """Name and place of each file in a tar, up to the first header that is none."""
+    """Find name and place of each file in a tar, up to the first header that is none."""
     at = 0
     while at + _BLOCK <= len(content) and content[at]:
         try:

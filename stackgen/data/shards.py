@@ -85,7 +85,7 @@ def encode_shard(samples: Iterable[Sample]) -> bytes:
 
 
 def write_shard(path: Path, samples: Iterable[Sample]) -> ShardEntry:
-    """Write one tar; returns its manifest entry (file, split, samples, sha256)."""
+    """Write one tar; answer its entry in the manifest."""
     those = list(samples)
     content = encode_shard(those)
     write_atomically(path, content)
@@ -143,7 +143,7 @@ def iterate_shard(content: bytes) -> Iterator[Sample]:
 
 
 def _members(sample: Sample) -> dict[str, bytes]:
-    """Bytes of each member by its suffix."""
+    """Give the bytes of each member by its suffix."""
     return {
         "meta.json": json.dumps(sample.meta, sort_keys=True).encode(),
         "poses.npy": _npy(sample.poses.astype("<f4")),

@@ -31,7 +31,8 @@ PLACEMENTS = 32
 Layer = tuple[tuple[int, int], ...]
 """Blocks of a layer as (shape index, left edge [cell]), as in a Design."""
 
-BlockList = tuple[int, ...]
+BlocksLeft = tuple[int, ...]
+"""(S,) blocks that are left, of each shape."""
 
 
 class CellRun(NamedTuple):
@@ -114,7 +115,7 @@ def designs(
     boxes = [i for i, shape in enumerate(catalogue) if not cross_section(shape)[1]]
 
     @cache
-    def from_row(row: int, left: BlockList) -> tuple[tuple[Layer, ...], ...]:
+    def from_row(row: int, left: BlocksLeft) -> tuple[tuple[Layer, ...], ...]:
         """Find all ways to fill a row and those above it with the blocks that are left."""
         if row == len(rows):
             return () if any(left) else ((),)
@@ -132,8 +133,11 @@ def designs(
 
 
 def _fillings(
-    runs: Sequence[tuple[CellRun, Sequence[int]]], left: BlockList, widths: Sequence[int], ground: frozenset[int] | None
-) -> Iterator[tuple[Layer, BlockList]]:
+    runs: Sequence[tuple[CellRun, Sequence[int]]],
+    left: BlocksLeft,
+    widths: Sequence[int],
+    ground: frozenset[int] | None,
+) -> Iterator[tuple[Layer, BlocksLeft]]:
     """Find all ways to fill the runs of a row, and the blocks that are then left.
 
     Args:

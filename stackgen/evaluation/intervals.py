@@ -21,7 +21,7 @@ class Estimate:
     high: float
 
     def to_json(self) -> dict[str, float]:
-        """Plain form."""
+        """Give the plain form."""
         return {"value": self.value, "low": self.low, "high": self.high}
 
 

@@ -150,7 +150,7 @@ METRICS = ChainMap[str, SceneMetric]({"side_iou": view_iou("side"), "top_iou": v
 
 
 def list_rank(ranked: ArrayLike, truth: ArrayLike) -> NDArray[np.int64]:
-    """Place of the true block list (B, S) among the ranked ones (B, T, S), counted from 0; T if absent.
+    """Find the place of the true block list (B, S) among the ranked ones (B, T, S), counted from 0; T if absent.
 
     >>> list_rank([[[1, 0], [0, 1]], [[1, 0], [2, 0]]], [[0, 1], [0, 2]]).tolist()
     [1, 2]

@@ -42,7 +42,7 @@ class StartFrom(pl.Callback):
         self.weights = weights
 
     def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Load them, unless the fit resumes from a checkpoint of its own."""
+        """Load the weights, unless the fit resumes from a checkpoint of its own."""
         if trainer.ckpt_path:
             return
         tensors, _ = read_weights(self.weights)
@@ -80,7 +80,7 @@ class Compile(pl.Callback):
         self.options: dict[str, Any] = {"backend": backend, "mode": mode, "dynamic": dynamic}
 
     def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Mark them; each is compiled when it is first called."""
+        """Mark the parts; each is compiled when it is first called."""
         known = dict(pl_module.named_modules())
         for part in self.parts:
             if part not in known:
@@ -89,11 +89,11 @@ class Compile(pl.Callback):
             known[part].compile(**self.options)
 
     def on_validation_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Run as written."""
+        """Let validation run as written."""
         torch.compiler.set_stance("force_eager")
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Run what is compiled."""
+        """Let training run compiled."""
         torch.compiler.set_stance("default")
 
     def on_exception(self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException) -> None:
@@ -193,11 +193,11 @@ class EMA(pl.Callback):
         self._raw = checkpoint.get(RAW_WEIGHTS)
 
     def state_dict(self) -> dict[str, Any]:
-        """How many updates the average has seen."""
+        """Give the number of updates that the average has seen."""
         return {"updates": self.updates}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Inverse of :meth:`state_dict`."""
+        """Invert :meth:`state_dict`."""
         self.updates = int(state_dict["updates"])
 
 
@@ -277,12 +277,12 @@ class SampleQuality(pl.Callback):
             log_picture(trainer, "sample/scenes", silhouette_sheet(firsts, shown, verdicts, sampler.world.grid))
 
     def _draw(self, sampler: StackSampler, scenes: list[Scene], rank: int) -> list[list[Stack]]:
-        """Stacks for some scenes, the same for the same weights."""
+        """Sample stacks for some scenes, the same for the same weights."""
         silhouettes, counts = np.stack([s.silhouette for s in scenes]), np.stack([s.counts for s in scenes])
         return sampler.sample_batch(silhouettes, counts, self.num_samples, batch_seed(self.seed, 0, rank))
 
     def _measure(self, sampler: StackSampler, scenes: list[Scene], stacks: list[list[Stack]]) -> dict[str, Part]:
-        """The metrics of some scenes, each as a sum and the weight that it is to be divided by."""
+        """Compute the metrics of some scenes, each as a sum and the weight that it is to be divided by."""
         scores = [r.score for r in check_scenes(scenes, stacks, self.checker or _NoPhysics(), sampler.world)]
         names = SCENE_METRICS if self.checker else ("diversity", "front_iou_before_physics")
         parts = {name: np.sum([SCENE_METRICS[name](score) for score in scores], axis=0) for name in names}
@@ -290,7 +290,7 @@ class SampleQuality(pl.Callback):
 
 
 def _mean(part: Part, device: torch.device) -> Tensor:
-    """The mean of a metric, all processes' scenes counting alike; NaN where it does not exist."""
+    """Compute a metric, all processes' scenes counting alike; NaN where it does not exist."""
     total, weight = part
     mean = MeanMetric(nan_strategy="ignore").to(device)
     mean.update(total / weight if weight else math.nan, weight)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import re
 import sys
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -32,14 +31,14 @@ def new_run(name: str, root: Path = RUNS, kind: str = "version") -> Path:
     """
     if not re.fullmatch(r"\w[\w.+-]*", name):
         raise StackgenError(f"run name {name!r}: use letters, digits, '_', '-', '+' and '.' only")
-    for number in count():
+    number = 0
+    while True:
         folder = root / name / f"{kind}_{number}"
         try:
             folder.mkdir(parents=True)
+            return folder
         except FileExistsError:
-            continue
-        return folder
-    raise AssertionError("count() ends never")
+            number += 1
 
 
 def new_shared_run(name: str, root: Path, kind: str) -> Path:

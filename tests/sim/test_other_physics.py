@@ -1,4 +1,4 @@
-"""Data of another world: whoever trains on them is told whose physics they were made with."""
+"""Data of another world: training on them warns of the physics that they were made with."""
 
 from __future__ import annotations
 

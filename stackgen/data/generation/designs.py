@@ -69,7 +69,7 @@ class DesignSettings:
 
 
 def cells_wide(shape: Shape) -> int:
-    """Cells of a row that a shape takes up."""
+    """Count the cells of a row that a shape takes up."""
     return math.ceil(shape.size[0] - _EPSILON)
 
 
@@ -90,7 +90,7 @@ class Design:
 
     @staticmethod
     def from_key(key: str) -> Design:
-        """Inverse of :attr:`key`."""
+        """Invert :attr:`key`."""
         rows = (row.split(",") for row in key.split("/"))
         return Design(tuple(tuple((int(s), int(x)) for s, x in (b.split("@") for b in row)) for row in rows))
 
@@ -161,7 +161,7 @@ def realize(design: Design, rng: np.random.Generator, world: World, settings: De
 
 
 def _separate(x: np.ndarray, widths: np.ndarray, rounds: int = 50) -> np.ndarray:
-    """Centres moved until no two neighbours of a row overlap."""
+    """Move centres until no two neighbours of a row overlap."""
     x = x.copy()
     need = (widths[1:] + widths[:-1]) / 2
     for _ in range(rounds):

@@ -33,7 +33,7 @@ class Executor(Protocol):
     """Maps a function over numbers."""
 
     def map(self, task: Callable[[int], T], numbers: Iterable[int]) -> Generator[tuple[int, T], None, None]:
-        """Each number with its result, as they come; closing the iterator ends all work.
+        """Yield each number with its result, as they come; closing the iterator ends all work.
 
         Raises:
             StackgenError: If workers die again and again.

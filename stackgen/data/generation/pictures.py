@@ -21,7 +21,7 @@ class Pictures:
         self._drawn: dict[tuple[int, bytes], Mask] = {}
 
     def front(self, stack: Stack) -> Mask:
-        """`silhouette(stack, "front", grid)`."""
+        """Draw what `silhouette(stack, grid, "front")` does."""
         picture = np.zeros((self.grid.image_size, self.grid.image_size), dtype=bool)
         for shape, pose in zip(stack.shapes.tolist(), stack.poses, strict=True):
             place = (shape, pose.tobytes())

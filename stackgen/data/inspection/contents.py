@@ -83,7 +83,7 @@ _KEY = re.compile(rb"\d+-(whole|\d\d(?:_\d\d)*)")
 
 
 def _depths(dataset: Dataset) -> NDArray[np.int64]:
-    """Blocks removed from each stack's template, by its key, split by split."""
+    """Count the blocks removed from each stack's template, by its key, split by split."""
     depths: list[int] = []
     for split in dataset.splits:
         for shard in dataset.shards(split):
@@ -143,7 +143,7 @@ def counts(contents: Contents) -> dict[str, dict[str, int]]:
 
 
 def distributions(contents: Contents) -> dict[str, Floats]:
-    """Measure of all blocks the distance from their place in the design, yaw and tilt."""
+    """Measure the distance of all blocks from their place in the design, their yaw and tilt."""
     arrays = contents.arrays
     real = arrays.shapes != PADDING
     poses = arrays.poses[real].astype(np.float64)
@@ -157,7 +157,7 @@ def distributions(contents: Contents) -> dict[str, Floats]:
 
 
 def beside_design(shapes: ArrayLike, x: Floats, world: World) -> Floats:
-    """(n,) distance [cell] of blocks from the nearest place at which they fill whole cells.
+    """Measure the distance (n,) [cell] of blocks from the nearest place at which they fill whole cells.
 
     >>> from stackgen.world import PAPER_WORLD
     >>> beside_design([0, 1], np.array([0.45, -0.9]), PAPER_WORLD).round(6).tolist()
@@ -169,7 +169,7 @@ def beside_design(shapes: ArrayLike, x: Floats, world: World) -> Floats:
 
 
 def describe(values: Floats) -> dict[str, float]:
-    """Moments, percentiles and the largest magnitude."""
+    """Compute moments, percentiles and the largest magnitude."""
     low, median, high = np.percentile(values, [1, 50, 99])
     return {
         "mean": float(values.mean()),
@@ -182,7 +182,7 @@ def describe(values: Floats) -> dict[str, float]:
 
 
 def sample_margins(contents: Contents, checker: StabilityChecker, number: int, seed: int = 0) -> Floats:
-    """(number,) largest tilt of the ground [degrees] that some stacks survive, drawn without replacement."""
+    """Compute the largest tilt of the ground (number,) [degrees] that stacks drawn without replacement survive."""
     size = min(number, len(contents.arrays))
     chosen = np.random.default_rng(seed).choice(len(contents.arrays), size, replace=False)
     verdicts = checker.check_all([contents.stack(i) for i in chosen])
@@ -190,13 +190,13 @@ def sample_margins(contents: Contents, checker: StabilityChecker, number: int, s
 
 
 def describe_margins(margins: Floats) -> dict[str, float]:
-    """Percentiles of the margins [degrees], and the shares of marginal stacks."""
+    """Compute percentiles of the margins [degrees], and the shares of marginal stacks."""
     shares = {f"share below {limit:g} degrees": float((margins < limit).mean()) for limit in (0.5, 1, 2, 5)}
     return {"stacks": len(margins), **describe(margins), **shares}
 
 
 def duplicates(contents: Contents, same: float = SAME) -> dict[str, int]:
-    """Stacks that are there more than once: the same shapes, all poses within `same` [cell, rad].
+    """Count the stacks that are there more than once: the same shapes, all poses within `same` [cell, rad].
 
     Returns:
         `stacks`, how many have a twin; `surplus`, how many could go; `across splits`, how many have a twin in
@@ -213,7 +213,7 @@ def duplicates(contents: Contents, same: float = SAME) -> dict[str, int]:
 
 
 def twin_pairs(arrays: StackArrays, world: World, same: float = SAME) -> NDArray[np.int64]:
-    """(P, 2) pairs of stacks, the earlier first, of the same shapes with all poses within `same` [cell, rad]."""
+    """Find pairs (P, 2) of stacks, the earlier first, of the same shapes with all poses within `same` [cell, rad]."""
     codes = as_scalars(layout_codes(arrays, world), arrays.shapes.shape[1])
     order = np.argsort(codes, kind="stable")
     starts = np.flatnonzero(np.concatenate([[True], codes[order][1:] != codes[order][:-1]]))
@@ -255,7 +255,7 @@ def nearness(contents: Contents, testset: Path) -> dict[str, Any] | None:
 
 
 def _held(train: StackArrays, test: StackArrays, world: World) -> int:
-    """Test stacks of which training has a twin."""
+    """Count the test stacks of which training has a twin."""
     columns = max(train.shapes.shape[1], test.shapes.shape[1])
     both = StackArrays.concatenate([_widened(train, columns), _widened(test, columns)])
     twins = twin_pairs(both, world)
@@ -271,7 +271,7 @@ def _widened(arrays: StackArrays, columns: int) -> StackArrays:
 
 
 def nearest_silhouettes(train: NDArray[np.uint8], test: NDArray[np.uint8], image_size: int) -> Floats:
-    """(T,) IoU of each test silhouette with the training silhouette, or its mirror image, that is most alike.
+    """Compute the IoU (T,) of each test silhouette with the training silhouette, or its mirror image, most like it.
 
     Args:
         train, test: (M, H * W / 8) and (T, H * W / 8), packed row by row.

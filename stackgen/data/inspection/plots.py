@@ -66,7 +66,7 @@ def _bars(axes: Axes, name: str, tally: Mapping[str, int]) -> None:
 
 
 def _histogram(axes: Axes, name: str, values: Floats) -> None:
-    """Between the percentiles that hold all but a thousandth on either side; what is beyond is counted in words."""
+    """Draw what lies between the percentiles that leave out a thousandth on either side; name the largest."""
     low, high = np.percentile(values, [0.1, 99.9])
     inside = values[(values >= low) & (values <= high)]
     heights = axes.hist(inside, bins=60, color=_BAR)[0]

@@ -28,7 +28,7 @@ def seen_layouts(
     positions: bool = False,
     mirror: bool = True,
 ) -> NDArray[np.bool_]:
-    """(M,) for each stack of `test` whether `train` holds a stack of the same layout.
+    """Tell for each stack of `test` (M,) whether `train` holds a stack of the same layout.
 
     The defaults call a layout seen in case of doubt, so that what is called unseen is.
 
@@ -60,7 +60,7 @@ def seen_layouts(
 def layout_codes(
     stacks: StackArrays, world: World, *, positions: bool = False, mirrored: bool = False
 ) -> NDArray[np.int32]:
-    """(M, N) layouts as numbers: equal rows, equal layouts.
+    """Write layouts as numbers (M, N): equal rows, equal layouts.
 
     Args:
         stacks: M of them.
@@ -91,6 +91,6 @@ def share_in_common(seen: NDArray[np.bool_]) -> str:
 
 
 def as_scalars(codes: NDArray[np.int32], columns: int) -> NDArray[np.void]:
-    """(M,) one value for each row of :func:`layout_codes`, padded to so many columns; to sort and compare."""
+    """Make one value of each row of :func:`layout_codes` (M,), padded to so many columns; to sort and compare."""
     padded = np.pad(codes, ((0, 0), (0, columns - codes.shape[1])), constant_values=_EMPTY)
     return np.ascontiguousarray(padded).view(np.dtype((np.void, padded.itemsize * columns))).ravel()

@@ -121,7 +121,7 @@ def _repeated(name: str, split: str, content: bytes, templates: NDArray[np.int64
 
 
 def sample_keys(content: bytes) -> list[bytes]:
-    """Keys of the samples in a tar, by their metadata's names."""
+    """Find the keys of the samples in a tar, by their metadata's names."""
     keys, suffix, at = [], b".meta.json\0", -1
     while (at := content.find(suffix, at + 1)) >= 0:
         header = at - at % _BLOCK

@@ -71,7 +71,7 @@ def read_diversity_limit(path: Path, test_set: str, physics: Mapping[str, Any]) 
     """
     how = "`python -m benchmarks.diversity_limit` makes it"
     try:
-        content = json.loads(path.read_text())["figures"]
+        content = json.loads(path.read_text())["figures"]  # the word of all files that benchmarks write
         if content["test_set"] != test_set or content["physics"] != physics:
             raise StackgenError(f"{path} is about another test set or other physics; {how}")
         layouts = {

@@ -93,13 +93,13 @@ class Child:
             raise StackgenError(f"{command[0]} cannot be started: {error.strerror}") from error
 
     def news(self) -> list[tuple[int, float]]:
-        """Values of the metric that were told since the last call, each with its number, from 1."""
+        """List the values of the metric that were told since the last call, each with its number, from 1."""
         known = len(self.told)
         self.told = values_told(self._metrics, self._metric)
         return list(enumerate(self.told, 1))[known:]
 
     def last_words(self) -> str:
-        """The last line that the program printed."""
+        """Give the last line that the program printed."""
         lines = self.log.read_text(errors="replace").strip().splitlines()
         return lines[-1].strip()[:300] if lines else "(it printed nothing)"
 

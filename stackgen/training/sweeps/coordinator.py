@@ -108,7 +108,7 @@ def next_trial(study: Study, sweep: Sweep, space: Mapping[str, BaseDistribution]
 
 
 def follow(study: Study, trial: Trial, child: Child, sweep: Sweep) -> FrozenTrial | None:
-    """Hear what a trial has to tell and give it up if it is no good; the trial if it has ended, else None."""
+    """Hear what a trial has to tell and give it up if it is no good; answer the trial if it has ended, else None."""
     from optuna.trial import TrialState
 
     code = child.process.poll()  # before the last values are read
@@ -140,12 +140,12 @@ def line_of(trial: FrozenTrial, sweep: Sweep) -> str:
 
 
 def trials_of(study: Study) -> list[FrozenTrial]:
-    """All trials in the order of their numbers, not copied."""
+    """List all trials in the order of their numbers, not copied."""
     return study.get_trials(deepcopy=False)
 
 
 def trials_wanted(sweep: Sweep) -> int:
-    """Number of trials of the whole sweep."""
+    """Count the trials of the whole sweep."""
     if sweep.method != "grid":
         return sweep.run_cap or DEFAULT_TRIALS
     points = math.prod(map(len, grid_of(space_of(sweep.parameters)).values()))
@@ -153,7 +153,7 @@ def trials_wanted(sweep: Sweep) -> int:
 
 
 def requeue(study: Study) -> int:
-    """Let the trials wait that an earlier coordinator started and did not see the end of; how many there are."""
+    """Let the trials wait that an earlier coordinator started and did not see the end of; answer how many there are."""
     from optuna.trial import TrialState
 
     left = study.get_trials(deepcopy=False, states=(TrialState.RUNNING,))

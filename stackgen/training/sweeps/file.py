@@ -101,9 +101,9 @@ class Sweep:
             raise StackgenError("a sweep needs parameters, such as {model.draws: {values: [1, 2, 4]}}")
 
     def to_json(self) -> dict[str, Any]:
-        """Plain form: a W&B sweep file again. What was left out is left out; a parameter's value may be null."""
+        """Give the plain form, a W&B sweep file, without what was left out; a parameter's value may be null."""
         return asdict(self, dict_factory=lambda items: {name: value for name, value in items if value is not None})
 
     def to_yaml(self) -> str:
-        """The file for `wandb sweep`."""
+        """Write the file for `wandb sweep`."""
         return yaml.safe_dump(self.to_json(), sort_keys=False)

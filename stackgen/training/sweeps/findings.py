@@ -35,7 +35,7 @@ _LETTERS = 24
 
 
 def value_of(trial: FrozenTrial) -> float:
-    """A trial's value of the metric: the last that was told; NaN if none was."""
+    """Give a trial's value of the metric: the last that was told; NaN if none was."""
     told = trial.intermediate_values
     return trial.value if trial.value is not None else told[max(told)] if told else math.nan
 
@@ -73,7 +73,7 @@ def write_findings(study: Study, sweep: Sweep, folder: Path) -> list[Path]:
 
 
 def leaderboard(trials: Sequence[FrozenTrial], sweep: Sweep) -> str:
-    """The trials as CSV, the best first."""
+    """Write the trials as CSV, the best first."""
     names = list(space_of(sweep.parameters))
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
@@ -87,7 +87,7 @@ def leaderboard(trials: Sequence[FrozenTrial], sweep: Sweep) -> str:
 
 
 def leaderboard_table(trials: Sequence[FrozenTrial], sweep: Sweep, most: int = 10) -> Table:
-    """The best trials for the terminal."""
+    """Make a table of the best trials for the terminal."""
     names = list(space_of(sweep.parameters))
     short = [name.rpartition(".")[2] for name in names]
     heads = [s if short.count(s) == 1 else name for s, name in zip(short, names, strict=True)]
@@ -103,7 +103,7 @@ def _shown(value: Any) -> str:
 
 
 def best_configuration(best: FrozenTrial, sweep: Sweep, folder: Path, trials: int) -> str:
-    """The whole configuration of the best trial's run, for `stackgen fit`; for other programs the trial's values."""
+    """Write the configuration of the best trial's run, for `stackgen fit`; for other programs the trial's values."""
     title = f"# The best of {trials} trials of the sweep {sweep.name}: trial {best.number}, "
     title += f"{sweep.metric.name} {best.value:.4g}.\n"
     runs = sorted(

@@ -18,7 +18,7 @@ METRICS_FILE = "STACKGEN_METRICS"
 
 
 def in_a_sweep() -> bool:
-    """Whether this process is a trial of `stackgen sweep`."""
+    """Tell whether this process is a trial of `stackgen sweep`."""
     return METRICS_FILE in os.environ
 
 

@@ -1,4 +1,4 @@
-"""Executors map numbers, survive what dies, and end with whoever asked."""
+"""Executors map numbers, survive what dies, and end with the process that asked."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The generator: the same dataset from the same settings, whoever makes it and however often it is cut off."""
+"""The generator: the same dataset from the same settings, whatever makes it and however often it is cut off."""
 
 from __future__ import annotations
 
