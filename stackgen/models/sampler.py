@@ -49,7 +49,7 @@ class NetworkSampler:
         """See StackSampler.
 
         Raises:
-            StackgenError: If a block list is empty or longer than the model takes, or sizes differ.
+            StackgenError: If a block list is empty, longer than the model takes or of other shapes, or sizes differ.
         """
         totals = self._check(silhouettes, counts, num_samples)
         stacks: list[list[Stack]] = []
@@ -72,12 +72,16 @@ class NetworkSampler:
         return stacks
 
     def _check(self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int) -> NDArray[np.int64]:
-        """(B,) number of blocks in each list."""
+        """Count the blocks of each list (B,)."""
         if num_samples < 1:
             raise StackgenError(f"the number of samples must be at least 1, got {num_samples}")
-        size = self.world.grid.image_size
+        size, shapes = self.world.grid.image_size, len(self.world.catalogue)
         if silhouettes.ndim != 3 or silhouettes.shape[1:] != (size, size) or len(counts) != len(silhouettes):
             raise StackgenError(f"sampling needs silhouettes (B, {size}, {size}) and as many block lists")
+        if np.shape(counts) != (len(silhouettes), shapes) or np.any(np.asarray(counts) < 0):
+            raise StackgenError(
+                f"a block list has {shapes} counts of 0 or more, one for each shape of the model's world"
+            )
         totals = np.asarray(counts).sum(axis=1)
         if len(totals) and not (totals.min() >= 1 and totals.max() <= self.world.max_blocks):
             raise StackgenError(

@@ -33,7 +33,7 @@ def inventory_counts(inventory: Inventory, catalogue: Catalogue) -> NDArray[np.i
     """Give the counts (S,) of an inventory in any of its forms.
 
     Raises:
-        StackgenError: On an unknown shape, a negative number, or no block at all.
+        StackgenError: On an unknown shape, a number that is negative or not whole, or no block at all.
 
     >>> from stackgen.world import PAPER_CATALOGUE
     >>> inventory_counts("cube=40, triangle=1", PAPER_CATALOGUE).tolist()
@@ -45,6 +45,8 @@ def inventory_counts(inventory: Inventory, catalogue: Catalogue) -> NDArray[np.i
         if isinstance(inventory, Mapping):
             counts = np.zeros(len(catalogue), dtype=np.int64)
             for name, number in inventory.items():
+                if not isinstance(number, int | np.integer):
+                    raise StackgenError(f"inventory: the number of {name} must be whole, got {number!r}")
                 counts[catalogue.index(name)] = number
         else:
             counts = np.asarray(inventory, dtype=np.int64)

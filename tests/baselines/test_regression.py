@@ -307,6 +307,8 @@ def test_samplers_keep_to_the_block_list_and_the_seed(config: TransformerConfig,
         ((1, 64, 64), [[11, 0, 0, 0]], 1, "1 to 10 blocks"),
         ((1, 32, 32), [[1, 0, 0, 0]], 1, "silhouettes"),
         ((2, 64, 64), [[1, 0, 0, 0]], 1, "as many block lists"),
+        ((1, 64, 64), [[1, 0, 0]], 1, "4 counts of 0 or more"),
+        ((1, 64, 64), [[2, -1, 0, 0]], 1, "4 counts of 0 or more"),
         ((1, 64, 64), [[1, 0, 0, 0]], 0, "at least 1"),
     ],
 )

@@ -53,7 +53,11 @@ def test_every_form_of_an_inventory_is_one() -> None:
 
 
 @pytest.mark.parametrize(
-    "wrong", ["cone=1", "cube", "cube=-1", "", "cube=0", {"cone": 1}, {"cube": -1}, np.array([1, 2]), np.zeros(4, int)]
+    "wrong",
+    [
+        *("cone=1", "cube", "cube=-1", "", "cube=0"),
+        *({"cone": 1}, {"cube": -1}, {"cube": 1.5}, {"cube": "many"}, np.array([1, 2]), np.zeros(4, int)),
+    ],
 )
 def test_what_is_no_inventory_is_refused_by_its_name(wrong: object) -> None:
     with pytest.raises(StackgenError, match=r"inventory|unknown shape"):
