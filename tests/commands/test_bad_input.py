@@ -19,6 +19,7 @@ from PIL import Image
 
 from stackgen.api import Model
 from stackgen.commands.cli import explain
+from stackgen.data.dataset import TESTSET
 from stackgen.errors import StackgenError
 from tests.conftest import CHILD, Answer, Cli, TinyWeights, allow_interrupts, stacks_json
 
@@ -152,6 +153,22 @@ def test_numbers_out_of_range_are_explained(
 ) -> None:
     assert_one_line(cli("sample", tower_image, option, value, "--out", tmp_path / "out"), str(value))
     assert files_below(tmp_path) == ["tower.png"]
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["predict", "--limit", 1],
+        ["generate", "--name", "x", "--stacks", 1, "--out", "x"],
+        ["dataset", "info", TESTSET, "--out", "x"],
+    ],
+)
+def test_a_negative_seed_is_one_line(
+    arguments: list[object], cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert_one_line(cli(*arguments, "--seed", -1), "seed", "at least 0")
+    assert files_below(tmp_path) == []
 
 
 # Stacks files.

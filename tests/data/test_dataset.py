@@ -19,6 +19,7 @@ from stackgen._lightning import pl
 from stackgen.data import Dataset, StackDataModule, decode, to_batch
 from stackgen.data.arrays import StackArrays
 from stackgen.data.compact import save_npz
+from stackgen.data.dataset import read_manifest
 from stackgen.data.shards import Sample, encode_shard
 from stackgen.errors import StackgenError
 from stackgen.world import PAPER_WORLD
@@ -63,6 +64,8 @@ def test_what_is_not_there_is_one_line(dataset: Path, compact: Path, tmp_path: P
         assert "\n" not in str(caught.value)
     with pytest.raises(StackgenError, match="is one compact file, not shards"):
         Dataset.open(compact).shards("train")
+    with pytest.raises(StackgenError, match="is one compact file, not a folder of shards"):
+        read_manifest(compact)
 
 
 # Webdataset, with the stages that this package exports.
