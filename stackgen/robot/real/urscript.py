@@ -132,7 +132,7 @@ class UrScriptFile:
         return "\n".join([*head, *self.lines, f'{_INDENT}textmsg("stackgen: done")', "end", ""])
 
 
-def urscript(plan: BuildPlan, workcell: Workcell, controller: Controller, gripper: Gripper, *, title: str = "") -> str:
+def urscript(plan: BuildPlan, workcell: Workcell, controller: Controller, gripper: Gripper) -> str:
     """Write a plan as a program that the arm can run on its own.
 
     Args:
@@ -140,7 +140,6 @@ def urscript(plan: BuildPlan, workcell: Workcell, controller: Controller, grippe
         workcell: Workcell of the plan.
         controller: Payload of the tool, and how near home the arm must be.
         gripper: Settings of the jaws.
-        title: What is built; the number of blocks by default.
 
     Raises:
         StackgenError: If a motion leaves the workcell's workspace or is too fast.
@@ -149,7 +148,7 @@ def urscript(plan: BuildPlan, workcell: Workcell, controller: Controller, grippe
     slots = {block: number for number, block in enumerate(plan.order, 1)}
     execute(plan, arm, on_start=lambda step: arm.begin(step, plan.stack, slots[step.block]))
     count = f"{len(plan.blocks)} of {len(plan.stack)} blocks"
-    return arm.program(title or f"{count}, in the order {', '.join(str(step.block) for step in plan.blocks)}.")
+    return arm.program(f"{count}, in the order {', '.join(str(step.block) for step in plan.blocks)}.")
 
 
 def numbers(values: Floats | tuple[float, ...]) -> str:

@@ -71,7 +71,6 @@ class SimulatedArm(Connected):
         frames: (4, 4) frame of each block at the beginning.
         physics: Physics of the blocks; its time step is the simulation's.
         grasp: How blocks are held: by friction, or by a fixed constraint.
-        on_step: Called after every step.
     """
 
     def __init__(
@@ -82,9 +81,9 @@ class SimulatedArm(Connected):
         physics: Physics,
         *,
         grasp: Grasp = "jaws",
-        on_step: Callable[[], None] = lambda: None,
     ) -> None:
-        self.workcell, self.stack, self.grasp, self.on_step = workcell, stack, grasp, on_step
+        self.workcell, self.stack, self.grasp = workcell, stack, grasp
+        self.on_step: Callable[[], None] = lambda: None  # called after every step
         super().__init__(connect(physics))
         self.physics = physics
         self.arm = load_arm(workcell, self.client, visual=True)
