@@ -62,14 +62,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["help"] and len(arguments) > 1:
         arguments = [*arguments[1:], "--help"]
-    if not arguments or arguments[0] in ("-h", "--help", "help"):
-        return _talk(usage())
-    if arguments[0] in ("-V", "--version", "version"):
-        return _talk(f"stackgen {_version()}")
-    verb, rest = arguments[0], arguments[1:]
-    if verb not in VERBS:
-        return _complain("", _unknown(verb), BAD_INPUT)
+    verb, *rest = arguments or ["--help"]
     try:
+        if verb in ("-h", "--help", "help"):
+            print(usage())
+            return _flushed(0)
+        if verb in ("-V", "--version", "version"):
+            print(f"stackgen {_version()}")
+            return _flushed(0)
+        if verb not in VERBS:
+            return _complain("", _unknown(verb), BAD_INPUT)
         return _flushed(importlib.import_module(VERBS[verb].module).run(verb, rest))
     except SystemExit as exit_:  # argparse's --help and the like
         return exit_.code if isinstance(exit_.code, int) else 0 if exit_.code is None else BAD_INPUT
@@ -89,7 +91,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def explain(error: BaseException) -> str | None:
-    """One line for an error that a user can mend, None for a bug."""
+    """Put an error that a user can mend in one line; None for a bug."""
     kinds = {kind.__name__ for kind in type(error).__mro__}
     text = " ".join(str(error).split())
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
@@ -106,7 +108,7 @@ def explain(error: BaseException) -> str | None:
 
 
 def usage() -> str:
-    """The table, for `stackgen --help`."""
+    """Write the table, for `stackgen --help`."""
     width = max(map(len, VERBS))
     rows = [f"  {name:<{width}}  {verb.help}" for name, verb in VERBS.items()]
     return "\n".join(
@@ -137,14 +139,6 @@ def _version() -> str:
         return "(not installed)"
 
 
-def _talk(text: str) -> int:
-    try:
-        print(text, flush=True)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 0
-
-
 def _flushed(code: int | None) -> int:
     """Flush here, where a broken pipe is still caught."""
     sys.stdout.flush()
@@ -152,12 +146,12 @@ def _flushed(code: int | None) -> int:
 
 
 def _complain(verb: str, message: str, code: int) -> int:
-    print(f"stackgen{' ' if verb else ''}{verb}: {message}", file=sys.stderr)
+    print(f"stackgen{' ' if verb else ''}{verb}: {message.removeprefix(f'{verb}: ')}", file=sys.stderr)
     return code
 
 
 def _debug() -> None:
-    """The traceback behind a line, for who asks for it with STACKGEN_DEBUG=1."""
+    """Print the traceback behind a line, if STACKGEN_DEBUG=1 asks for it."""
     if os.environ.get("STACKGEN_DEBUG"):
         traceback.print_exc()
 

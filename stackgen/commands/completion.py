@@ -41,7 +41,7 @@ def whole_parser() -> ArgumentParser:
 
 
 def parsers_of(verb: str) -> ArgumentParser | dict[str, ArgumentParser]:
-    """The parser of a verb; for a verb that has parts, their parsers by name."""
+    """Make the parser of a verb; for a verb that has parts, their parsers by name."""
     module = importlib.import_module(VERBS[verb].module)
     if hasattr(module, "COMMAND"):
         return module.COMMAND.parser()

@@ -175,7 +175,7 @@ def _statics(manifest: Manifest) -> StabilityChecker:
 
 
 def _print_facts(found: Mapping[str, Any]) -> None:
-    """What `dataset info` found, for the terminal."""
+    """Print what `dataset info` found."""
     from stackgen.data.inspection.plots import duplicate_words, margin_words, nearness_words
 
     console = Console()

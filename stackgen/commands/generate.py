@@ -53,7 +53,7 @@ def main(
 
 
 def _range(text: str) -> range:
-    """The numbers of A:B.
+    """Read the numbers of A:B.
 
     >>> _range("10:12")
     range(10, 12)

@@ -21,7 +21,7 @@ from stackgen.world import Catalogue
 
 
 def _catalogue(value: Any) -> Catalogue:
-    """A catalogue from what stands in YAML, or from what jsonargparse makes of a default."""
+    """Make a catalogue from what stands in YAML, or from what jsonargparse makes of a default."""
     if isinstance(value, Mapping) and "init_args" in value:
         return Catalogue(value["init_args"]["shapes"])
     return Catalogue.from_config(value)
@@ -101,7 +101,7 @@ class Command:
     config: str | None = None
 
     def parser(self) -> ArgumentParser:
-        """The parser; it raises its errors instead of printing them."""
+        """Make the parser; it raises its errors instead of printing them."""
         parser = ArgumentParser(
             prog=f"stackgen {self.verb}",
             description=(self.function.__doc__ or "").partition("\n\n")[0].strip(),
@@ -170,7 +170,7 @@ class Command:
 
 
 def epilog(example: str) -> str:
-    """Command lines as they stand under a help."""
+    """Lay out command lines as they stand under a help."""
     return "\n".join(["example:", *(f"  {line.strip()}" for line in example.strip().splitlines())])
 
 
@@ -211,7 +211,7 @@ def own_sections(verb: str, argv: Sequence[str]) -> list[str]:
 
 
 def option_values(arguments: Sequence[str], flags: Sequence[str]) -> list[tuple[int, str]]:
-    """The values given to an option, with their places in the arguments.
+    """Find the values given to an option, with their places in the arguments.
 
     >>> option_values(["a", "-c", "x.yaml", "--config=y.yaml"], ("-c", "--config"))
     [(2, 'x.yaml'), (3, 'y.yaml')]
@@ -227,7 +227,7 @@ def option_values(arguments: Sequence[str], flags: Sequence[str]) -> list[tuple[
 
 
 def _own_text(file: Path, verb: str) -> str | None:
-    """What is to stand in the place of a configuration file; None for the file as it is."""
+    """Give the text that is to stand in the place of a configuration file; None for the file as it is."""
     try:
         written = file.read_text() if file.is_file() else ""
         content = yaml.safe_load(text := renew(written))
@@ -245,7 +245,7 @@ _NOISE = re.compile(
 
 
 def _shorten(message: str, limit: int = 300) -> str:
-    """The gist of jsonargparse's paragraphs, as one line.
+    """Shorten jsonargparse's paragraphs to one line.
 
     >>> _shorten("Parser key 'data.mode':\\n  Errors:\\n  - Expected a float. Got value: q\\n  - Expected a path but q")
     'data.mode: Expected a float. Got value: q'
@@ -253,4 +253,5 @@ def _shorten(message: str, limit: int = 300) -> str:
     lines = [line.strip() for line in message.splitlines() if line.strip() and not _NOISE.match(line.strip())]
     text = " ".join(dict.fromkeys(line.removeprefix("- ") for line in lines))  # each member of a union says it
     text = re.sub(r"""^Parser key ["'](.*?)["']""", r"\1", re.sub(r"<class '([\w.]+)'>", r"\1", text))
+    text = re.sub(r"a typing\.Literal\[(.*?)\]", r"one of \1", text)
     return text if len(text) <= limit else f"{text[:limit].rstrip()} ..."

@@ -120,7 +120,7 @@ def _budget(verify: CheckerName | None, budget: str | None) -> Budget | None:
 
 
 def result_folders(images: Sequence[Path], out: Path) -> list[Path]:
-    """A folder for each image: `out` itself for one, else one in it, named like the image; equal names are numbered.
+    """Name a folder for each image: `out` itself for one, else one in it like the image; equal names are numbered.
 
     Raises:
         StackgenError: If no folder can be made there.
@@ -174,7 +174,7 @@ def run(verb: str, argv: Sequence[str]) -> int | None:
 
 
 def with_checker(argv: Sequence[str]) -> list[str]:
-    """`--verify` alone means the simulator.
+    """Write out what `--verify` alone means: the simulator.
 
     >>> with_checker(["a.png", "--verify", "--budget", "1s"])
     ['a.png', '--verify', 'simulator', '--budget', '1s']

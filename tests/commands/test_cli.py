@@ -101,11 +101,11 @@ def test_interrupted_sample_leaves_the_finished_images_only(
     cli: Cli, towers: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     images = [draw_tower(tmp_path / f"{name}.png") for name in "abc"]
-    judged, check = [], towers.checker.check
+    checked, check = [], towers.checker.check
 
     def check_until_ctrl_c(stack: object) -> object:
-        judged.append(stack)
-        if len(judged) == 3:
+        checked.append(stack)
+        if len(checked) == 3:
             raise KeyboardInterrupt
         return check(stack)  # type: ignore[arg-type]
 
@@ -123,10 +123,10 @@ def test_check_answers_by_its_exit_code_and_names_what_fell(cli: Cli, stands: Pa
     assert "stands" in answer.out
     falls = tmp_path / "falls.json"
     falls.write_text(json.dumps(stacks_json([("cube", 0, 0.5)], [("cube", 0, 0.5), ("triangle", 1.5, 3.5)])))
-    answer = cli("check", falls, "--out", tmp_path / "judged.json")
+    answer = cli("check", falls, "--out", tmp_path / "checked.json")
     assert answer.code == 1
     assert "block 1 (triangle) 3.0 cells" in answer.out
-    verdicts = [entry.verdict for entry in read_stacks(tmp_path / "judged.json").entries]
+    verdicts = [entry.verdict for entry in read_stacks(tmp_path / "checked.json").entries]
     assert [verdict and verdict.stable for verdict in verdicts] == [True, False]
     assert verdicts[1] is not None
     np.testing.assert_allclose(verdicts[1].settled.poses[1, 2], 0.5, atol=0.02)

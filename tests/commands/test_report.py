@@ -1,4 +1,4 @@
-"""stackgen report: made once, then read; gone on with, and wrong settings in one line."""
+"""stackgen report: made once, then read; continued, and wrong settings in one line."""
 
 from __future__ import annotations
 

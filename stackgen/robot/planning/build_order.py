@@ -90,7 +90,8 @@ def plan_order(
 
     Args:
         stack: Stack as it is to stand in the end.
-        checker: Checker that says which states stand; statics by default. The margins always come from statics.
+        checker: Checker that says which states stand; statics by default. The margins always come from statics, with
+            its physics.
         approach: Function that says which blocks can be brought to their places; :class:`TopDownJaws` by default.
         strategy: `safest`, or `greedy`: the paper's order, checked in the same way, but not changed.
 
@@ -138,7 +139,8 @@ class _StateChecks:
 
     def __init__(self, stack: Stack, checker: StabilityChecker | None, approach: Approach) -> None:
         self.stack = stack
-        self.statics = checker if isinstance(checker, StaticsChecker) else StaticsChecker()
+        physics = None if checker is None else checker.physics
+        self.statics = checker if isinstance(checker, StaticsChecker) else StaticsChecker(physics)  # type: ignore[arg-type]
         self.checker = checker or self.statics
         self.approach = approach
         self.states: dict[int, _State] = {}
