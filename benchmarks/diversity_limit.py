@@ -30,11 +30,10 @@ from stackgen.evaluation.protocol import Scene, load_scenes
 from stackgen.evaluation.report.references import LIMIT_FILE, format_layout
 from stackgen.evaluation.results import PREDICTED_LIST, TRUE_LIST
 from stackgen.protocols import StabilityChecker, Verdict
-from stackgen.sampling.feasible import layout
 from stackgen.sampling.methods import load_predictor
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
-from stackgen.stack import Stack
+from stackgen.stack import Stack, layout
 from stackgen.world import PAPER_GRID, PAPER_WORLD
 
 SAMPLES = 3

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.world import PAPER_CATALOGUE, Catalogue
+from stackgen.world import PAPER_CATALOGUE, Catalogue, Grid
 
 Floats = NDArray[np.float64]
 
@@ -111,3 +111,18 @@ def shapes_of(counts: ArrayLike) -> NDArray[np.int64]:
     """
     array = np.asarray(counts, dtype=np.int64)
     return np.repeat(np.arange(len(array)), array)
+
+
+Layout = tuple[tuple[int, ...], ...]
+
+
+def layout(stack: Stack, grid: Grid) -> Layout:
+    """List the shapes of each layer, bottom layer first, left to right; a block is in the layer nearest to its centre.
+
+    >>> stack = Stack([0, 1, 0], [[1, 0, 0.5, 0, 0, 0], [0, 0, 1.6, 0, 0, 0], [-1, 0, 0.4, 0, 0, 0]])
+    >>> layout(stack, Grid())
+    ((0, 0), (1,), (), ())
+    """
+    layers = np.clip(np.floor(stack.poses[:, 2]), 0, grid.height - 1).astype(int)
+    order = np.argsort(stack.poses[:, 0], kind="stable")
+    return tuple(tuple(int(stack.shapes[i]) for i in order if layers[i] == level) for level in range(grid.height))

@@ -3,7 +3,7 @@
 A design puts blocks into the cells of the grid: whole cells, all at y = 0, shapes that may stand in the top
 row alone nowhere else. It matches a silhouette if it fills exactly the cells that the silhouette fills. Inside
 a run of filled cells blocks then lie side by side, so the shapes of each row from left to right say where each
-lies: the designs that match are as many layouts (:func:`stackgen.sampling.feasible.layout`), and finitely many.
+lies: the designs that match are as many layouts (:func:`stackgen.stack.layout`), and finitely many.
 Whether one stands is said by a StabilityChecker.
 
 Legend: S shapes, H x W pixels, n samples a scene.
@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike
 from stackgen.data.generation.designs import Design, DesignSettings, cells_wide, realize
 from stackgen.geometry import silhouette_iou
 from stackgen.protocols import StabilityChecker
-from stackgen.sampling.feasible import RUN_TOLERANCE, VALID_IOU, Layout, cross_section, row_runs
+from stackgen.sampling.feasible import RUN_TOLERANCE, VALID_IOU, cross_section, row_runs
+from stackgen.stack import Layout
 from stackgen.world import Grid, World
 
 PLACEMENTS = 32
@@ -97,7 +98,7 @@ def designs(
         StackgenError: If a shape is not one cell high.
 
     >>> from stackgen.geometry import silhouette
-    >>> from stackgen.stack import Stack
+    >>> from stackgen.stack import Layout, Stack
     >>> from stackgen.world import PAPER_GRID, PAPER_WORLD
     >>> wide = Stack([1, 0], [[0, 0, 0.5, 0, 0, 0], [1.5, 0, 0.5, 0, 0, 0]])  # a rectangle, a cube to its right
     >>> for design in designs(silhouette(wide, PAPER_GRID), [1, 1, 0, 0], PAPER_WORLD):
@@ -212,7 +213,7 @@ def answers(
 
 
 def layout_of(design: Design, grid: Grid) -> Layout:
-    """Give a design's layout, as `stackgen.sampling.feasible.layout` does for its stack."""
+    """Give a design's layout, as `stackgen.stack.layout` does for its stack."""
     rows = [tuple(shape for shape, _ in row) for row in design.rows]
     return (*rows, *[()] * (grid.height - len(rows)))
 

@@ -18,8 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
 from stackgen.protocols import Verdict
-from stackgen.sampling.feasible import VALID_IOU, Layout, layout
-from stackgen.stack import Stack
+from stackgen.sampling.feasible import VALID_IOU
+from stackgen.stack import Layout, Stack, layout
 from stackgen.world import Grid, Mask, View
 
 

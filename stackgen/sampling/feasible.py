@@ -1,4 +1,4 @@
-"""Layouts of stacks, and the block lists that can make a silhouette row by row."""
+"""The block lists that can make a silhouette row by row."""
 
 from __future__ import annotations
 
@@ -9,26 +9,10 @@ from numpy.typing import ArrayLike
 
 from stackgen.baselines.heuristic import Interval, section
 from stackgen.errors import StackgenError
-from stackgen.stack import Stack
 from stackgen.world import Catalogue, Grid, Mask, Shape, World
 
 VALID_IOU = 0.8
 """Front IoU from which a standing stack counts as matching the target, for valid diversity."""
-
-
-Layout = tuple[tuple[int, ...], ...]
-
-
-def layout(stack: Stack, grid: Grid) -> Layout:
-    """List the shapes of each layer, bottom layer first, left to right; a block is in the layer nearest to its centre.
-
-    >>> stack = Stack([0, 1, 0], [[1, 0, 0.5, 0, 0, 0], [0, 0, 1.6, 0, 0, 0], [-1, 0, 0.4, 0, 0, 0]])
-    >>> layout(stack, Grid())
-    ((0, 0), (1,), (), ())
-    """
-    layers = np.clip(np.floor(stack.poses[:, 2]), 0, grid.height - 1).astype(int)
-    order = np.argsort(stack.poses[:, 0], kind="stable")
-    return tuple(tuple(int(stack.shapes[i]) for i in order if layers[i] == level) for level in range(grid.height))
 
 
 RUN_TOLERANCE = 0.24

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
 from stackgen.protocols import CheckerName, StabilityChecker, StackSampler, Verdict
-from stackgen.sampling.feasible import VALID_IOU, Layout, layout
-from stackgen.stack import Stack
+from stackgen.sampling.feasible import VALID_IOU
+from stackgen.stack import Layout, Stack, layout
 from stackgen.world import Grid, Mask, World
 
 MATCH = 0.95

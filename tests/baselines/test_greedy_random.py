@@ -13,8 +13,7 @@ from stackgen.baselines.greedy_random import GreedyRandom, layer_runs
 from stackgen.baselines.swap import swap, swaps
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette, silhouette_iou
-from stackgen.sampling.feasible import layout
-from stackgen.stack import Stack, parse_block_list
+from stackgen.stack import Stack, layout, parse_block_list
 from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID
 
 CUBE, RECTANGLE, LONG, TRIANGLE = range(4)

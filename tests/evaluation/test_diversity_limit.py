@@ -15,10 +15,10 @@ from stackgen.evaluation.diversity_limit import answers, cell_runs, designs, exp
 from stackgen.evaluation.metrics import SampleScore, SceneScore, valid_diversity
 from stackgen.geometry import silhouette
 from stackgen.protocols import StabilityChecker, Verdict
-from stackgen.sampling.feasible import can_make, layout
+from stackgen.sampling.feasible import can_make
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
-from stackgen.stack import Stack
+from stackgen.stack import Stack, layout
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Grid, Mask, Shape, World
 from stackgen.world import Catalogue as Shapes
 

@@ -10,8 +10,8 @@ import pytest
 from stackgen.data.generation.designs import draw_design, realize
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette
-from stackgen.sampling.feasible import can_make, layout
-from stackgen.stack import Stack
+from stackgen.sampling.feasible import can_make
+from stackgen.stack import Stack, layout
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Catalogue, Shape, World
 
 CUBE, RECTANGLE, LONG, TRIANGLE = range(4)

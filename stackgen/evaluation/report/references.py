@@ -16,7 +16,7 @@ from stackgen.evaluation.diversity_limit import expected_diversity
 from stackgen.evaluation.intervals import Estimate, clustered_ratio
 from stackgen.evaluation.metrics import valid_diversity
 from stackgen.evaluation.results import Evaluation
-from stackgen.sampling.feasible import Layout
+from stackgen.stack import Layout
 
 _ASSETS = Path(__file__).parents[2] / "assets"
 LIMIT_FILE = _ASSETS / "testset-v1-diversity-limit.json"

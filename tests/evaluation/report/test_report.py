@@ -42,8 +42,7 @@ from stackgen.evaluation.results import (
     write_evaluation,
 )
 from stackgen.evaluation.tables import PAPER_COLUMNS
-from stackgen.sampling.feasible import Layout
-from stackgen.stack import Stack
+from stackgen.stack import Layout, Stack
 
 ONE: Layout = ((0, 0), (1,), (), ())
 OTHER: Layout = ((1,), (0, 0), (), ())

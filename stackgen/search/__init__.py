@@ -1,0 +1,1 @@
+"""The best stacks for any silhouette, by search instead of learning."""
