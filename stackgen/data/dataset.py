@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stackgen.data.manifest import SPLITS, Manifest, Split
-from stackgen.data.shards import Sample, read_shard
+from stackgen.data.shards import Sample
 from stackgen.data.sources import Shard, is_folder, is_remote, locate, read_bytes
 from stackgen.errors import StackgenError
 from stackgen.world import World
@@ -98,13 +98,16 @@ class Dataset:
         return self._splits[name]
 
     def samples(self, split: str) -> Iterator[Sample]:
-        """Read the samples of a split of a local folder, in order, with their metadata.
+        """Read the samples of a split, in order, with their metadata; broken ones are named and skipped.
 
         Raises:
             StackgenError: If a shard is missing or is not the one that was written.
         """
+        from stackgen.data.decoding import SkipLog, read_samples
+
+        log = SkipLog()
         for shard in self.shards(split):
-            yield from read_shard(shard.path, shard.sha256)
+            yield from read_samples(shard, self.world, log)
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.data.arrays import FIELDS, PADDING, StackArrays
+from stackgen.data.shards import PackedSample, Sample, find_samples
 from stackgen.data.sources import Shard, is_remote
 from stackgen.errors import StackgenError, warn
 from stackgen.world import World
@@ -29,8 +30,6 @@ NAMED = 10
 LONG = 500_000
 """Samples from which on reading them shows its progress: some ten seconds."""
 
-_BLOCK = 512  # bytes; a tar is headers and contents, each filled up to whole blocks
-_REGULAR = b"0\0"  # types of members that are files
 _POSE = 6
 
 
@@ -47,24 +46,26 @@ class Decoded:
     Args:
         stacks: M of them.
         positions: (M,) int64, their places among all samples of the shard, ascending.
+        keys: Their M names.
         broken: Key and fault of each broken sample, as text.
     """
 
     stacks: StackArrays
     positions: NDArray[np.int64]
+    keys: tuple[str, ...]
     broken: tuple[str, ...] = ()
 
 
 def decode_shard(content: bytes, world: World) -> Decoded:
     """Decode the samples of a tar; each is checked by itself, so that a broken one costs no other."""
     keys, rows, positions, broken = [], [], [], []
-    for position, (key, members) in enumerate(_samples(content)):
+    for position, packed in enumerate(find_samples(content)):
         try:
-            rows.append(_row(content, members, world))
+            rows.append(_row(content, packed, world))
         except Exception as error:  # noqa: BLE001 - whatever strange bytes may lead to
-            broken.append(f"{key}: {_fault(error)}")
+            broken.append(f"{packed.key}: {_fault(error)}")
         else:
-            keys.append(key)
+            keys.append(packed.key)
             positions.append(position)
     real, shapes, poses, silhouettes, template = _assemble(rows, world)
     beyond = ((shapes >= len(world.catalogue)) & real).any(1)
@@ -73,7 +74,8 @@ def decode_shard(content: bytes, world: World) -> Decoded:
     columns, where = (shapes, poses, silhouettes, template), np.array(positions, np.int64)
     if not sound.all():
         columns, where = tuple(column[sound] for column in columns), where[sound]
-    return Decoded(StackArrays(*columns, num_shapes=len(world.catalogue)), where, tuple(broken))
+        keys = [keys[i] for i in np.flatnonzero(sound)]
+    return Decoded(StackArrays(*columns, num_shapes=len(world.catalogue)), where, tuple(keys), tuple(broken))
 
 
 _Row = tuple[bytes, bytes, bytes, int]
@@ -92,22 +94,24 @@ def _assemble(rows: list[_Row], world: World) -> tuple[NDArray, NDArray, NDArray
     return real, padded, placed, packed, np.array(template, np.int64)
 
 
-def _row(content: bytes, members: dict[bytes, slice], world: World) -> _Row:
+def _row(content: bytes, packed: PackedSample, world: World) -> _Row:
     """Read one sample.
 
     Raises:
         Exception: If a part is missing or not what the format says.
     """
-    shape, shapes = _npy(content[members[b"shapes.npy"]], np.dtype(np.uint8))
+    packed.check()
+    members = packed.members
+    shape, shapes = _npy(content[members["shapes.npy"]], np.dtype(np.uint8))
     if len(shape) != 1 or not 1 <= shape[0] <= world.max_blocks:
         raise ValueError(f"shapes of size {shape}, not of 1 to {world.max_blocks} blocks")
-    size, poses = _npy(content[members[b"poses.npy"]], np.dtype("<f4"))
+    size, poses = _npy(content[members["poses.npy"]], np.dtype("<f4"))
     if size != (*shape, _POSE):
         raise ValueError(f"poses of size {size} for {shape[0]} blocks")
-    pixels, silhouette = _npy(content[members[b"silhouette.npy"]], np.dtype(np.uint8))
+    pixels, silhouette = _npy(content[members["silhouette.npy"]], np.dtype(np.uint8))
     if pixels != (world.grid.image_size, world.grid.image_size // 8):
         raise ValueError(f"a packed silhouette of size {pixels}, not of {world.grid.image_size} pixels square")
-    template = json.loads(content[members[b"meta.json"]])["template"]
+    template = json.loads(content[members["meta.json"]])["template"]
     if not isinstance(template, int) or not -(2**63) <= template < 2**63:
         raise ValueError(f"template {template!r:.40}")
     return shapes, poses, silhouette, template
@@ -135,38 +139,9 @@ def _npy_header(header: bytes) -> tuple[tuple[int, ...], np.dtype]:
     return shape, kind
 
 
-def _samples(content: bytes) -> Iterator[tuple[str, dict[bytes, slice]]]:
-    """Find key and members of each sample: neighbours that share the part of their name before the first dot."""
-    key, members = b"", dict[bytes, slice]()
-    for name, place in _members(content):
-        here, _, suffix = name.partition(b".")
-        if here != key and members:
-            yield key.decode(errors="replace"), members
-            members = {}
-        key = here
-        members[suffix] = place
-    if members:
-        yield key.decode(errors="replace"), members
-
-
-def _members(content: bytes) -> Iterator[tuple[bytes, slice]]:
-    """Find name and place of each file in a tar, up to the first header that is none."""
-    at = 0
-    while at + _BLOCK <= len(content) and content[at]:
-        try:
-            size = int(content[at + 124 : at + 136].strip(b" \0") or b"0", 8)
-        except ValueError:
-            return
-        start = at + _BLOCK
-        if content[at + 156] in _REGULAR:
-            yield content[at : at + 100].rstrip(b"\0"), slice(start, start + size)
-        at = start + -(-size // _BLOCK) * _BLOCK
-
-
 def _fault(error: Exception) -> str:
     if isinstance(error, KeyError):
-        name = error.args[0]
-        return f"no {name.decode() if isinstance(name, bytes) else name}"
+        return f"no {error.args[0]}"
     return " ".join(str(error).split()) or type(error).__name__
 
 
@@ -223,6 +198,19 @@ def read_decoded(shard: Shard, world: World) -> tuple[Decoded, list[Skipped]]:
         skipped = Skipped(f"{error}; its {shard.samples} samples are skipped", shard.samples)
         return decode_shard(b"", world), [skipped]
     return _decode_sound(content, shard, world)
+
+
+def read_samples(shard: Shard, world: World, log: SkipLog) -> list[Sample]:
+    """Read the samples of a shard one by one, with their metadata: those that :func:`decode_shard` takes, no others.
+
+    Raises:
+        StackgenError: If the shard is missing or is not the one that was written.
+    """
+    content = shard.read()
+    decoded, skipped = _decode_sound(content, shard, world)
+    log.add(skipped)
+    packed = find_samples(content)
+    return [packed[position].decode(content) for position in decoded.positions]
 
 
 def decode_shards(shards: Sequence[Shard], world: World, log: SkipLog) -> StackArrays:

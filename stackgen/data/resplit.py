@@ -12,9 +12,11 @@ from typing import Any, Literal
 
 from stackgen.data.card import write_card
 from stackgen.data.dataset import read_manifest
+from stackgen.data.decoding import SkipLog, read_samples
 from stackgen.data.generation.designs import Design
 from stackgen.data.manifest import SPLITS, Manifest, Split, split_of
-from stackgen.data.shards import Sample, read_shard, write_shard
+from stackgen.data.shards import Sample, write_shard
+from stackgen.data.sources import Shard
 from stackgen.errors import StackgenError
 from stackgen.world import World
 
@@ -92,7 +94,7 @@ def _write(
         entries.append(write_shard(out / f"{split}-{len(entries):06d}.tar", waiting[split]))
         waiting[split] = []
 
-    for read, samples in enumerate(_shards(folder, manifest), 1):
+    for read, (_, samples) in enumerate(_shards(folder, manifest), 1):
         for sample in samples:
             group = _group(sample, how.by, manifest)
             if group not in sides:
@@ -108,9 +110,12 @@ def _write(
     return entries
 
 
-def _shards(folder: Path, manifest: Manifest) -> Iterator[list[Sample]]:
+def _shards(folder: Path, manifest: Manifest) -> Iterator[tuple[Split, list[Sample]]]:
+    """Read the samples of each shard that are not broken, and the split that they are in."""
+    log = SkipLog()
     for entry in manifest.shards:
-        yield list(read_shard(folder / entry["file"], entry["sha256"]))
+        yield entry["split"], read_samples(Shard(str(folder), entry), manifest.world, log)
+    log.report(str(folder))
 
 
 def _group(sample: Sample, by: By, manifest: Manifest) -> Any:
@@ -145,17 +150,19 @@ def split_table(
     """
     templates: dict[str, set[Any]] = {split: set() for split in SPLITS}
     designs: dict[str, set[Any]] = {split: set() for split in SPLITS}
-    for read, (entry, samples) in enumerate(zip(manifest.shards, _shards(folder, manifest), strict=True), 1):
+    stacks = dict.fromkeys(SPLITS, 0)
+    for read, (split, samples) in enumerate(_shards(folder, manifest), 1):
+        stacks[split] += len(samples)
         for sample in samples:
-            templates[entry["split"]].add(sample.meta["template"])
-            designs[entry["split"]].add(_canonical(sample.meta.get("layout"), manifest.world))
+            templates[split].add(sample.meta["template"])
+            designs[split].add(_canonical(sample.meta.get("layout"), manifest.world))
         if progress:
             progress(read)
     for known in designs.values():
         known.discard(None)
     return {
         split: {
-            "stacks": manifest.count(split),
+            "stacks": stacks[split],
             "templates": len(templates[split]),
             "designs": len(designs[split]),
             "designs in another split too": len(

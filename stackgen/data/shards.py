@@ -4,6 +4,9 @@ A dataset is a folder with `dataset.json` and `<split>-<number>.tar`. A sample i
 share a key and that numpy reads: `.shapes.npy` uint8 (k,), `.poses.npy` float32 (k, 6),
 `.silhouette.npy` uint8 (H, W/8) (the front silhouette, `np.packbits` along the rows) and
 `.meta.json`. Nothing in a shard depends on when or where it was written: equal stacks, equal bytes.
+
+Shards that others wrote are read as the webdataset package reads them: neighbours that share a key are a sample,
+and what belongs to no sample is ignored.
 """
 
 from __future__ import annotations
@@ -11,10 +14,11 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import re
 import tarfile
 import tokenize
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +117,8 @@ def read_shard(path: str | Path, sha256: str | None = None) -> Iterator[Sample]:
     """
     try:
         content = Path(path).read_bytes()
+        if compressed := compression_of(content):
+            raise ValueError(f"it is compressed with {compressed}, and a shard is a plain tar")
         if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:
             raise ValueError("its checksum is not the one in dataset.json (`stackgen dataset repair` makes it again)")
         yield from iterate_shard(content)
@@ -126,20 +132,142 @@ def iterate_shard(content: bytes) -> Iterator[Sample]:
     Raises:
         tarfile.TarError, KeyError, ValueError, EOFError, tokenize.TokenError: If the bytes are damaged.
     """
-    members: dict[str, Any] = {}
-    with tarfile.open(fileobj=io.BytesIO(content), mode="r:") as tar:
-        for member in tar:
-            key, _, suffix = member.name.partition(".")
-            file = tar.extractfile(member)
-            if file is None:
+    files, end = _files(content)
+    # Python's reader takes a damaged header, or no end at all, for the end of the archive.
+    if len(content) < end + 2 * tarfile.BLOCKSIZE or any(content[end:]):
+        raise ValueError("it ends too early")
+    for packed in _grouped(files):
+        yield packed.decode(content)
+
+
+@dataclass(slots=True)
+class PackedSample:
+    """Where the members of one sample lie in a tar.
+
+    Args:
+        key: Name of the sample.
+        members: Place of each member by its suffix; others than those of the format are not listed.
+        twice: Suffixes that came again.
+    """
+
+    key: str
+    members: dict[str, slice] = field(default_factory=dict)
+    twice: list[str] = field(default_factory=list)
+
+    def check(self) -> None:
+        """Refuse a sample with members that are missing or contradict each other.
+
+        Raises:
+            ValueError: The message says which members.
+        """
+        if len(self.members) < len(MEMBERS) or self.twice:
+            missing = [name for name in MEMBERS if name not in self.members]
+            raise ValueError(f"no {', '.join(missing)}" if missing else f"{', '.join(self.twice)} twice")
+
+    def decode(self, content: bytes) -> Sample:
+        """Decode the sample from the bytes of its tar.
+
+        Raises:
+            ValueError: If a member is missing or not what the format says.
+        """
+        try:
+            self.check()
+        except ValueError as error:
+            raise ValueError(f"sample {self.key}: {error}") from error
+        return decode({"__key__": self.key, **{name: content[place] for name, place in self.members.items()}})
+
+
+MEMBERS = ("meta.json", "poses.npy", "shapes.npy", "silhouette.npy")
+"""Suffixes of a sample's members."""
+
+
+def find_samples(content: bytes) -> list[PackedSample]:
+    """Find the samples of a tar, broken ones included, as webdataset groups them."""
+    return list(_grouped(_files(content)[0]))
+
+
+_COMPRESSED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ": "xz", b"\x28\xb5\x2f\xfd": "zstd"}
+
+
+def compression_of(content: bytes) -> str | None:
+    """Name the program that compressed some bytes; None for a plain tar.
+
+    >>> compression_of(b"\x1f\x8b..."), compression_of(b"00000.meta.json")
+    ('gzip', None)
+    """
+    return next((name for mark, name in _COMPRESSED.items() if content.startswith(mark)), None)
+
+
+_MEMBERS = frozenset(MEMBERS)
+_File = tuple[str, slice]
+"""Name and place of a file in a tar."""
+
+_NAME = re.compile(r"((?:.*/|)[^.]+)\.([^/]*)", re.DOTALL)  # key and suffix, as webdataset takes them apart
+_FOREIGN = re.compile(r"__[^/]*__($|/)")  # what webdataset keeps for itself
+_PLAIN = {ord("0"): True, 0: True, ord("5"): False}
+"""Types of members that need no other reader than :func:`_plain_files`, and whether they are files."""
+
+
+def _grouped(files: Iterable[_File]) -> Iterator[PackedSample]:
+    """Put neighbours that share a key together; those without a member of the format are no samples."""
+    current = PackedSample("")
+    for name, place in files:
+        key, suffix = _key_and_suffix(name)
+        if key != current.key:
+            if not key:
                 continue
-            members[suffix] = file.read()
-            if len(members) == 4:
-                yield decode({"__key__": key, **members})
-                members = {}
-        # Python's reader takes a damaged header, or no end at all, for the end of the archive.
-        if members or len(content) < tar.offset + 2 * tarfile.BLOCKSIZE or any(content[tar.offset :]):
-            raise ValueError("it ends too early")
+            if current.members:
+                yield current
+            current = PackedSample(key)
+        if suffix in current.members:
+            current.twice.append(suffix)
+        elif suffix in _MEMBERS:
+            current.members[suffix] = place
+    if current.members:
+        yield current
+
+
+def _key_and_suffix(name: str) -> tuple[str, str]:
+    """Take a file's name apart; the key is empty if the file is part of no sample."""
+    if "/" not in name and not name.startswith("__"):
+        key, dot, suffix = name.partition(".")
+        return (key, suffix.lower()) if dot else ("", "")
+    match = None if _FOREIGN.match(name) else _NAME.fullmatch(name)
+    return (match[1], match[2].lower()) if match else ("", "")
+
+
+def _files(content: bytes) -> tuple[list[_File], int]:
+    """Find the files of a tar, and the place where its members end."""
+    plain = _plain_files(content)
+    if plain is not None:
+        return plain
+    found = []
+    try:
+        with tarfile.open(fileobj=io.BytesIO(content), mode="r:") as tar:
+            for member in tar:
+                if member.isreg() and not member.issparse():
+                    found.append((member.name, slice(member.offset_data, member.offset_data + member.size)))
+            return found, tar.offset
+    except (tarfile.TarError, ValueError, EOFError):
+        return found, 0
+
+
+def _plain_files(content: bytes) -> tuple[list[_File], int] | None:
+    """Read headers that hold all there is to know, many times as fast as tarfile; None if one of them does not."""
+    at, found = 0, []
+    while at + tarfile.BLOCKSIZE <= len(content) and content[at]:
+        kind, start = content[at + 156], at + tarfile.BLOCKSIZE
+        if kind not in _PLAIN or content[at + 345]:  # the second half of a long name
+            return None
+        try:
+            size = int(content[at + 124 : at + 136].strip(b" \0") or b"0", 8)
+        except ValueError:
+            return None
+        if _PLAIN[kind]:
+            name = content[at : at + 100].partition(b"\0")[0].decode("utf-8", "surrogateescape")
+            found.append((name, slice(start, start + size)))
+        at = start + -(-size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
+    return found, at
 
 
 def _members(sample: Sample) -> dict[str, bytes]:

@@ -17,6 +17,7 @@ import time
 from pathlib import Path
 
 from stackgen.data.manifest import ShardEntry
+from stackgen.data.shards import compression_of
 from stackgen.errors import StackgenError
 
 PIPE = "pipe:"
@@ -120,6 +121,8 @@ class Shard:
             content = read_bytes(self.path)
         except StackgenError as error:
             raise StackgenError(f"shard {self.name} is missing or damaged: {error}") from error
+        if compressed := compression_of(content):
+            raise StackgenError(f"shard {self.path} is compressed with {compressed}, and a shard is a plain tar")
         if hashlib.sha256(content).hexdigest() != self.sha256:
             cure = "fetch it again" if is_remote(self.path) else "`stackgen dataset repair` makes it again"
             why = "cut short or altered, its checksum is not the one in dataset.json"

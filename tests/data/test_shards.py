@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import bz2
+import gzip
 import io
 import json
+import lzma
 import tarfile
+import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +18,12 @@ import pytest
 import webdataset
 
 from stackgen.data.dataset import Dataset
-from stackgen.data.manifest import FORMAT, SPLITS, Manifest
-from stackgen.data.shards import Sample, decode, read_shard, write_shard
+from stackgen.data.inspection.verify import verify
+from stackgen.data.manifest import FORMAT, SPLITS, Manifest, shard_entry
+from stackgen.data.resplit import Resplit, resplit
+from stackgen.data.shards import MEMBERS, Sample, decode, find_samples, read_shard, write_shard
 from stackgen.errors import StackgenError
-from stackgen.world import PAPER_CATALOGUE
+from stackgen.world import PAPER_CATALOGUE, PAPER_WORLD
 
 
 def assert_same(a: Sample, b: Sample) -> None:
@@ -166,3 +173,137 @@ def test_a_folder_without_a_proper_manifest_is_refused(tmp_path: Path, text: str
     with pytest.raises(StackgenError, match=message) as caught:
         Dataset.open(tmp_path)
     assert "\n" not in str(caught.value)
+
+
+# Shards that others wrote.
+
+FORMATS = {"ustar": tarfile.USTAR_FORMAT, "gnu": tarfile.GNU_FORMAT, "pax": tarfile.PAX_FORMAT}
+
+
+def packed(files: dict[str, bytes], kind: int = tarfile.USTAR_FORMAT, folder: str | None = None) -> bytes:
+    """A tar of some files, after an entry for their folder if that is given."""
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w", format=kind) as tar:
+        if folder is not None:
+            entry = tarfile.TarInfo(folder)
+            entry.type = tarfile.DIRTYPE
+            tar.addfile(entry)
+        for name, content in files.items():
+            member = tarfile.TarInfo(name)
+            member.size = len(content)
+            tar.addfile(member, io.BytesIO(content))
+    return buffer.getvalue()
+
+
+def files_of(path: Path) -> dict[str, bytes]:
+    """The files of a tar by name."""
+    with tarfile.open(path) as tar:
+        return {member.name: file.read() for member in tar if (file := tar.extractfile(member))}
+
+
+def found_by_webdataset(path: Path) -> list[Sample]:
+    """What webdataset makes of a shard; it knows nothing of samples that are none."""
+    rows = webdataset.WebDataset(str(path), shardshuffle=False, empty_check=False)
+    return [decode(row) for row in rows if {*MEMBERS} & {*row}]
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize(
+    "renamed",
+    [
+        lambda name: name,
+        lambda name: f"./{name}",
+        lambda name: f"some/folder.v2/{name}",
+        lambda name: f"{'long' * 22}/{'longer' * 12}/{name}",
+        lambda name: f"bücher-{name}",
+        lambda name: name.replace("npy", "NPY"),
+    ],
+    ids=["plain", "dot", "folder", "long", "umlaut", "capitals"],
+)
+def test_a_tar_of_another_program_is_read_as_webdataset_reads_it(
+    kind: str, renamed: Callable[[str], str], three: tuple[Path, dict[str, Any]]
+) -> None:
+    path, _ = three
+    theirs = {renamed(name): content for name, content in files_of(path).items()}
+    some = list(theirs)
+    mixed: dict[str, bytes] = {"README.md": b"read me", "__meta__/a.meta.json": b"{}", "nodot": b""}
+    for place, name in enumerate(some):
+        mixed[name] = theirs[name]
+        if place % 4 == 1:
+            mixed[f".hidden{place}"] = b""
+            mixed[f"{name.split('.poses')[0].split('.POSES')[0]}.note.txt"] = b"?"
+    path.write_bytes(packed(mixed, FORMATS[kind], "some"))
+    ours, webs = list(read_shard(path)), found_by_webdataset(path)
+    assert len(ours) == len(webs) == 3
+    for here, there in zip(ours, webs, strict=True):
+        assert_same(here, there)
+    assert [sample.key for sample in find_samples(path.read_bytes())] == [sample.key for sample in webs]
+
+
+@pytest.fixture
+def holes(samples: dict[str, list[Sample]], tmp_path: Path) -> Path:
+    """A dataset of ten samples; two, not neighbours, lack their shapes, one has them twice, all have a note."""
+    folder = tmp_path / "holes"
+    folder.mkdir()
+    path = folder / "train-000001.tar"
+    write_shard(path, samples["train-000000.tar"][:10])
+    content: list[tuple[str, bytes]] = []
+    for name, data in files_of(path).items():
+        if name in ("0000002.shapes.npy", "0000005.shapes.npy"):
+            continue
+        content += [(name, data)] * (2 if name == "0000007.shapes.npy" else 1)
+        content += [(name.replace("meta.json", "note.txt"), b"x")] if name.endswith("meta.json") else []
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w") as tar:
+        for name, data in content:
+            member = tarfile.TarInfo(name)
+            member.size = len(data)
+            tar.addfile(member, io.BytesIO(data))
+    path.write_bytes(buffer.getvalue())
+    Manifest("holes", 0, PAPER_WORLD, {}, {}, (shard_entry(path.name, buffer.getvalue(), 10),)).save(folder)
+    return folder
+
+
+def test_broken_samples_are_named_and_skipped_alike_by_all_who_read_a_dataset(
+    holes: Path, samples: dict[str, list[Sample]], tmp_path: Path
+) -> None:
+    left = [sample for i, sample in enumerate(samples["train-000000.tar"][:10]) if i not in (2, 5, 7)]
+    faults = ["0000002: no shapes.npy", "0000005: no shapes.npy", "0000007: shapes.npy twice"]
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = list(Dataset.open(holes).samples("train"))
+        again = resplit(holes, tmp_path / "again", Resplit(0.3, 0.2))
+        trained = Dataset.open(holes).split("train")
+    for here, there in zip(found, left, strict=True):
+        assert_same(here, there)
+    lines = [str(warning.message) for warning in said]
+    assert all(sum(f"skipped a broken sample of train-000001.tar, {fault}" in line for line in lines) == 3
+               for fault in faults)  # fmt: skip
+    assert trained.template.tolist() == [sample.meta["template"] for sample in left]
+    assert sum(again.counts.values()) == len(left) and not verify(tmp_path / "again")
+    copies = [
+        sample for split in SPLITS if again.count(split) for sample in Dataset.open(tmp_path / "again").samples(split)
+    ]
+    for sample in left:
+        assert_same(next(copy for copy in copies if copy.key == sample.key), sample)
+    assert [problem.detail for problem in verify(holes)] == [f"sample {fault}" for fault in faults]
+
+
+@pytest.mark.parametrize("press", [gzip.compress, bz2.compress, lzma.compress])
+def test_a_compressed_shard_is_named_as_such(press: Callable[[bytes], bytes], holes: Path, tmp_path: Path) -> None:
+    path = holes / "train-000001.tar"
+    content = press(path.read_bytes())
+    path.write_bytes(content)
+    Manifest("holes", 0, PAPER_WORLD, {}, {}, (shard_entry(path.name, content, 10),)).save(holes)
+    readers: list[Callable[[], object]] = [
+        lambda: list(read_shard(path)),
+        lambda: list(Dataset.open(holes).samples("train")),
+        lambda: Dataset.open(holes).split("train"),
+        lambda: resplit(holes, tmp_path / "again", Resplit(0.3, 0.2)),
+    ]
+    for reader in readers:
+        with pytest.raises(
+            StackgenError, match=r"train-000001\.tar .* compressed with (gzip|bzip2|xz), and a shard is"
+        ):
+            reader()
+    assert "compressed with" in verify(holes)[0].detail

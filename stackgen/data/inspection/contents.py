@@ -17,9 +17,9 @@ from scipy.spatial import cKDTree
 
 from stackgen.data.arrays import PADDING, StackArrays
 from stackgen.data.dataset import Dataset
+from stackgen.data.decoding import decode_shard
 from stackgen.data.generation.designs import cells_wide
 from stackgen.data.inspection.seen_layouts import as_scalars, layout_codes, seen_layouts
-from stackgen.data.inspection.verify import sample_keys
 from stackgen.data.manifest import SPLITS, Manifest
 from stackgen.geometry import tilt
 from stackgen.protocols import StabilityChecker
@@ -61,8 +61,7 @@ class Contents:
         number = np.repeat([SPLITS.index(name) for name in dataset.splits], [len(part) for part in parts])
         depth = np.full(len(arrays), -1)
         if not dataset.is_compact:
-            found = _depths(dataset)
-            depth = found if len(found) == len(arrays) else depth
+            depth = _depths(dataset)
         return Contents(arrays, number, depth, dataset.manifest)
 
     def of(self, split: str) -> StackArrays:
@@ -79,7 +78,7 @@ class Contents:
         )
 
 
-_KEY = re.compile(rb"\d+-(whole|\d\d(?:_\d\d)*)")
+_KEY = re.compile(r"\d+-(whole|\d\d(?:_\d\d)*)")
 
 
 def _depths(dataset: Dataset) -> NDArray[np.int64]:
@@ -87,9 +86,9 @@ def _depths(dataset: Dataset) -> NDArray[np.int64]:
     depths: list[int] = []
     for split in dataset.splits:
         for shard in dataset.shards(split):
-            for key in sample_keys(shard.read()):
+            for key in decode_shard(shard.read(), dataset.world).keys:
                 match = _KEY.fullmatch(key)
-                depths.append(-1 if match is None else 0 if match[1] == b"whole" else match[1].count(b"_") + 1)
+                depths.append(-1 if match is None else 0 if match[1] == "whole" else match[1].count("_") + 1)
     return np.array(depths, np.int64)
 
 

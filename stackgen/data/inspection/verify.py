@@ -10,15 +10,14 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stackgen.data.dataset import read_manifest
-from stackgen.data.decoding import decode_shard
+from stackgen.data.decoding import Decoded, decode_shard
 from stackgen.data.generation.workshop import PARTS, PROGRESS
 from stackgen.data.manifest import Manifest, ShardEntry
+from stackgen.data.shards import compression_of
 
 Fault = Literal["missing", "truncated", "altered", "unreadable", "wrong", "foreign"]
-_BLOCK = 512  # of a tar; a member's name is the beginning of one [byte]
 _END = 1024  # zero bytes at least at the end of a tar
 _RECORD = 10240  # a tar is padded to a multiple of it [byte]
 
@@ -71,7 +70,7 @@ def verify(folder: Path, progress: Callable[[int], None] | None = None) -> list[
 class _Seen:
     """Shards of the keys and splits of the templates met so far: a key is unique, a template in one split only."""
 
-    keys: dict[bytes, str]
+    keys: dict[str, str]
     splits: dict[int, str]
 
 
@@ -95,6 +94,8 @@ def _of_shard(folder: Path, manifest: Manifest, entry: ShardEntry, seen: _Seen) 
         return [Problem(name, "missing", f"{entry['samples']} stacks")]
     except OSError as error:
         return [Problem(name, "unreadable", error.strerror or str(error))]
+    if compressed := compression_of(content):
+        return [Problem(name, "altered", f"it is compressed with {compressed}, and a shard is a plain tar")]
     decoded = decode_shard(content, manifest.world)
     readable = len(decoded.positions)
     if hashlib.sha256(content).hexdigest() != entry["sha256"]:
@@ -104,30 +105,20 @@ def _of_shard(folder: Path, manifest: Manifest, entry: ShardEntry, seen: _Seen) 
     problems = [Problem(name, "unreadable", f"sample {text}") for text in decoded.broken]
     if readable + len(decoded.broken) != entry["samples"]:
         problems.append(Problem(name, "wrong", f"{readable} stacks, but dataset.json says {entry['samples']}"))
-    return problems + _repeated(name, entry["split"], content, decoded.stacks.template, seen)
+    return problems + _repeated(name, entry["split"], decoded, seen)
 
 
-def _repeated(name: str, split: str, content: bytes, templates: NDArray[np.int64], seen: _Seen) -> list[Problem]:
+def _repeated(name: str, split: str, decoded: Decoded, seen: _Seen) -> list[Problem]:
     problems = []
-    for key in sample_keys(content):
+    for key in decoded.keys:
         if key in seen.keys:
-            problems.append(Problem(name, "wrong", f"key {key.decode()} is in {seen.keys[key]} too"))
+            problems.append(Problem(name, "wrong", f"key {key} is in {seen.keys[key]} too"))
         seen.keys[key] = name
-    for template in np.unique(templates).tolist():
+    for template in np.unique(decoded.stacks.template).tolist():
         if seen.splits.setdefault(template, split) != split:
             detail = f"template {template} is on two sides, {split} and {seen.splits[template]}"
             problems.append(Problem(name, "wrong", detail))
     return problems
-
-
-def sample_keys(content: bytes) -> list[bytes]:
-    """Find the keys of the samples in a tar, by their metadata's names."""
-    keys, suffix, at = [], b".meta.json\0", -1
-    while (at := content.find(suffix, at + 1)) >= 0:
-        header = at - at % _BLOCK
-        if b"\0" not in content[header:at]:  # else it is not a name, but part of what a member holds
-            keys.append(content[header:at])
-    return keys
 
 
 def _foreign(folder: Path, manifest: Manifest) -> list[Problem]:
