@@ -1,0 +1,129 @@
+"""Text files that a person may have written or saved: how they are decoded and parsed, wherever one is read.
+
+Numbers in YAML are those of YAML 1.2, as the command line reads them: `1e-3` is a number, `2026-01-01` is text. What
+:func:`to_yaml` writes is read back by any reader of YAML as what it was.
+"""
+
+from __future__ import annotations
+
+import codecs
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from stackgen.errors import StackgenError
+
+_MARKS = {codecs.BOM_UTF16_LE: "UTF-16", codecs.BOM_UTF16_BE: "UTF-16"}
+_FLOAT = re.compile(
+    r"[-+]?[0-9][0-9_]*(\.[0-9_]*([eE][-+]?[0-9]+)?|[eE][-+]?[0-9]+)|[-+]?\.[0-9][0-9_]*([eE][-+]?[0-9]+)?"
+    r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
+)
+
+
+def read_text(path: str | Path) -> str:
+    """Read a text file: UTF-8, with or without a byte order mark.
+
+    Raises:
+        StackgenError: If it is missing, no file, or text of another encoding; the line names it.
+    """
+    try:
+        return decode_text(Path(path).read_bytes(), path)
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise StackgenError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
+
+
+def decode_text(content: bytes, path: str | Path) -> str:
+    """Decode the bytes of a text file, which errors call `path`.
+
+    Raises:
+        StackgenError: If they are not UTF-8.
+    """
+    for mark, name in _MARKS.items():
+        if content.startswith(mark):
+            raise StackgenError(f"{path} is text in {name}; save it as UTF-8")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise StackgenError(f"{path} is not text in UTF-8 (line {line}); save it as UTF-8") from None
+
+
+def read_yaml(path: str | Path) -> Any:
+    """Read a YAML file.
+
+    Raises:
+        StackgenError: If it cannot be read or is no YAML; the line names it and the place in it.
+    """
+    return parse_yaml(read_text(path), path)
+
+
+def parse_yaml(text: str, path: str | Path) -> Any:
+    """Parse YAML; errors call it `path`.
+
+    Raises:
+        StackgenError: If it is no YAML.
+    """
+    try:
+        return yaml.load(text, Loader=_Loader)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        where = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
+        raise StackgenError(f"{path} is not YAML{where}: {error.problem or error.context}") from None
+    except (yaml.YAMLError, ValueError) as error:  # ValueError: a number with too many digits
+        raise StackgenError(f"{path} is not YAML: {' '.join(str(error).split())}") from None
+    except RecursionError:
+        raise StackgenError(f"{path} is not YAML that is read here: it is nested too deeply") from None
+
+
+def read_json(path: str | Path) -> Any:
+    """Read a JSON file.
+
+    Raises:
+        StackgenError: If it cannot be read or is no JSON; the line names it and the place in it.
+    """
+    return parse_json(read_text(path), path)
+
+
+def parse_json(text: str, path: str | Path) -> Any:
+    """Parse JSON; errors call it `path`.
+
+    Raises:
+        StackgenError: If it is no JSON.
+    """
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError as error:
+        raise StackgenError(f"{path} is not JSON at line {error.lineno}, column {error.colno}: {error.msg}") from None
+    except ValueError as error:
+        raise StackgenError(f"{path} is not JSON: {error}") from None
+    except RecursionError:
+        raise StackgenError(f"{path} is not JSON that is read here: it is nested too deeply") from None
+
+
+def to_yaml(content: Any) -> str:
+    """Write YAML; text that a reader could take for a number, a date or a truth value is put in quotes."""
+    return yaml.dump(content, Dumper=_Dumper, default_flow_style=False, allow_unicode=True, sort_keys=False)
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.1 as PyYAML reads it, with the numbers of YAML 1.2 and without dates."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes text in quotes if any version of YAML would not read it as text."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Write everything out, for people."""
+        return True
+
+
+_Loader.yaml_implicit_resolvers = {
+    first: [(tag, pattern) for tag, pattern in those if tag.rpartition(":")[2] not in ("timestamp", "float")]
+    for first, those in yaml.SafeLoader.yaml_implicit_resolvers.items()
+}
+for _kind in (_Loader, _Dumper):
+    # After those that are there: a whole number stays one.
+    _kind.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(f"(?:{_FLOAT.pattern})$"), [*"-+.0123456789"])
