@@ -247,15 +247,18 @@ def test_the_command_line_verifies_and_answers_by_its_exit_code(
     answer = cli("sample", "--blocks", "cube=3", "--verify", "simulator", "--budget", "8", *options)
     assert answer.code == 1 and "stack 1 falls: nothing stable was found for it" in answer.out
     assert read_stacks(tmp_path / "out" / "stacks.json").sampler == {"verify": "simulator", "draws": 8}
-    assert cli("sample", "--blocks", "cube=3", *options).code == 0  # unverified, it only reports
+    assert cli("sample", "--one_shot", "--blocks", "cube=3", *options).code == 0  # unverified, it only reports
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--budget", "1s"], "--verify"),
+        (["--one_shot", "--budget", "1s"], "--verify"),
+        (["--budget", "64"], "--verify"),
+        (["--one_shot", "--cells", "3"], "--cells"),
+        (["--cells", "9"], "cells"),
         (["--verify", "--budget", "soon"], "a time, such as 1s"),
-        (["--inventory", "cube=1"], "tower.png: the inventory cube=1 is too small"),
+        (["--one_shot", "--inventory", "cube=1"], "tower.png: the inventory cube=1 is too small"),
         (["--inventory", "cone=1"], "unknown shape 'cone'"),
         (["--inventory", "cube=9", "--blocks", "cube=3"], "not both"),
         (["--sampler.steps", "0"], "at least 1"),

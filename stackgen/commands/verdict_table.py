@@ -24,7 +24,7 @@ def verdict_table(heading: str, sources: Iterable[tuple[str, Sequence[StackEntry
         sources: Where stacks came from, and those stacks with their verdicts.
         most: Largest number of fallen blocks to name for each stack; all by default.
     """
-    table = Table(heading, "stack", "verdict", "front IoU", "what fell", box=None, pad_edge=False)
+    table = Table(heading, "stack", "verdict", "front IoU", "matches", "what fell", box=None, pad_edge=False)
     for column in (table.columns[1], table.columns[3]):
         column.justify = "right"
     for source, entries in sources:
@@ -35,6 +35,7 @@ def verdict_table(heading: str, sources: Iterable[tuple[str, Sequence[StackEntry
                 str(number),
                 STANDS if stands else FALLS,
                 "" if entry.front_iou is None else f"{entry.front_iou:.2f}",
+                "" if entry.matches is None else "yes" if entry.matches else "no",
                 describe_fall(entry.stack, entry.verdict, most) if entry.verdict else "",
             )
     return table

@@ -27,6 +27,7 @@ from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.models.weights import resolve
 from stackgen.protocols import CheckerName, StackSampler
 from stackgen.sampling.verified import Budget, VerifiedSampler, checker_named
+from stackgen.search.sampler import SearchMethod
 from stackgen.world import World
 
 PROTOCOL = 1
@@ -110,7 +111,7 @@ class Loaded:
         """Tell the sampler from all others: the hash of its weights or of its code, and its settings."""
         sampler, weights = _base(self.model.sampler), self.model.weights
         settings = dict(self.model.sampler.settings)
-        if weights is not None and not isinstance(sampler, Heuristic):
+        if weights is not None and not isinstance(sampler, Heuristic | SearchMethod):
             return {"weights": weights.sha256, "settings": settings}
         name = sampler.card.get("name") or self.weights
         return {"weights": name, "settings": settings, "code": code_hash(type(sampler))}

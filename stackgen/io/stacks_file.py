@@ -25,6 +25,9 @@ from stackgen.stack import Stack
 from stackgen.world import PAPER_WORLD, Catalogue, Grid, Mask, World
 
 FORMAT = "stackgen.stacks/1"
+MATCHES = 0.9
+"""Front IoU from which on a stack that stands is said to match what was asked for."""
+
 SCHEMA_PATH = Path(__file__).with_name("stacks.schema.json")
 
 
@@ -57,6 +60,13 @@ class StackEntry:
     front_iou: float | None = None
     comment: str = ""
 
+    @property
+    def matches(self) -> bool | None:
+        """Whether it stands and its front IoU is at least `MATCHES`; None where that is not known."""
+        if self.verdict is None or self.front_iou is None:
+            return None
+        return self.verdict.stable and self.front_iou >= MATCHES
+
 
 @dataclass(frozen=True)
 class StacksFile:
@@ -68,7 +78,7 @@ class StacksFile:
         target: (H, W) front silhouette asked for.
         silhouette: File name of the picture it came from.
         block_list: (S,) counts asked for.
-        block_list_source: Whether the network chose the block list, or a person gave it.
+        block_list_source: Whether the network or the search chose the block list, or a person gave it.
         physics: Settings of the simulation behind the verdicts, as `Physics.to_json` gives them.
         seed: Seed of the sampling.
         weights: Weights that made the stacks.
@@ -83,7 +93,7 @@ class StacksFile:
     target: Mask | None = None
     silhouette: str | None = None
     block_list: NDArray[np.int64] | None = None
-    block_list_source: Literal["cnn", "given"] | None = None
+    block_list_source: Literal["cnn", "search", "given"] | None = None
     physics: Mapping[str, Any] | None = None
     seed: int | None = None
     weights: Weights | None = None
@@ -284,6 +294,8 @@ def entry_to_json(entry: StackEntry) -> dict[str, Any]:
             plain["verdict"]["margin"] = float(verdict.margin)
     if entry.front_iou is not None:
         plain["front_iou"] = float(entry.front_iou)
+    if entry.matches is not None:
+        plain["matches"] = entry.matches
     return plain
 
 

@@ -1,4 +1,4 @@
-"""Methods by name: heuristics, and the networks behind weights.
+"""Methods by name: heuristics, the search, and the networks behind weights.
 
 torch is imported only where weights are read, so that a heuristic needs none.
 """
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from stackgen.baselines import HEURISTICS
 from stackgen.errors import StackgenError
 from stackgen.protocols import BlockListPredictor, StackSampler
+from stackgen.search.sampler import NAME, SearchBlockLists, SearchSampler
 from stackgen.world import PAPER_WORLD
 
 if TYPE_CHECKING:
@@ -19,22 +20,26 @@ if TYPE_CHECKING:
 
 
 def load_sampler(weights: str | Path = "default") -> StackSampler:
-    """Load the sampler behind a name (of a heuristic or of weights), a `.safetensors` or `.ckpt` file, or a run folder.
+    """Load the sampler behind a name (`search`, a heuristic's, that of weights), a weights file or a run.
 
     Raises:
         StackgenError: If there is no such thing, or it holds something else.
     """
     if str(weights) in HEURISTICS:
         return HEURISTICS[str(weights)](PAPER_WORLD)
+    if str(weights) == NAME:
+        return SearchSampler()
     return _load(weights, "sampler", _samplers())
 
 
 def load_predictor(weights: str | Path = "default") -> BlockListPredictor:
-    """Load the block-list predictor behind a name of weights, a `.safetensors` or `.ckpt` file, or a run folder.
+    """Load the block-list predictor behind a name (`search`, or that of weights), a weights file or a run.
 
     Raises:
         StackgenError: If there is no such thing, or it holds something else.
     """
+    if str(weights) == NAME:
+        return SearchBlockLists()
     return _load(weights, "block-list predictor", _predictors())
 
 
@@ -52,7 +57,9 @@ def role_of(weights: str | Path) -> str:
 def _load(weights: str | Path, what: str, makers: Mapping[str, Maker]) -> Any:
     from stackgen.models.weights import build, read_weights
 
-    tensors, card = read_weights(weights, *(("sampler", tuple(HEURISTICS)) if what == "sampler" else ("predictor",)))
+    tensors, card = read_weights(
+        weights, *(("sampler", (*HEURISTICS, NAME)) if what == "sampler" else ("predictor", (NAME,)))
+    )
     if card.get("kind") not in makers:
         raise StackgenError(f"{weights} holds weights of kind {card.get('kind')!r}, not of a {what}")
     return build(weights, card, tensors, makers[card["kind"]])

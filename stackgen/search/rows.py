@@ -184,7 +184,7 @@ def pack(gains: Gains, widths: Ints, keep: int, depth: int, left: Ints | None = 
     """Find the best rows of distinct sequences of shapes, each at its best places.
 
     A sequence's first shapes are bounded by the best that any shapes can add to their right, so that of all sequences
-    of a length the `keep` best beginnings are enough to find the `keep` best rows, where neither `depth` nor `left` forbids any.
+    of a length the `keep` best beginnings are enough to find the `keep` best rows, where `depth` and `left` allow all.
 
     Args:
         gains: (B, S, W + 1) gain of each shape with its left end at each column.

@@ -41,8 +41,8 @@ class SearchMethod:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Its settings, as JSON allows."""
-        return asdict(self.search)
+        """Its settings, as JSON allows; what has no limit is left out."""
+        return {name: value for name, value in asdict(self.search).items() if value is not None}
 
     @property
     def card(self) -> dict[str, Any]:

@@ -94,7 +94,8 @@ class Limits:
 
 _ROWS = 150  # rows of a level that the best-first search knows; all there are, for lists of the paper's world
 _LOOKS = 400  # beginnings that it judges
-_MENDINGS = 12  # finished stacks that small moves cannot make stand, until no more is tried
+_MENDINGS = 1200  # squares of the numbers of blocks of the finished stacks that are made to stand by small moves
+_MENDABLE = 16  # largest number of blocks for which moves are tried
 _POPS = 4000  # combinations that it takes out of the queue
 _BEAM = 12  # beginnings that the beam keeps at a level, at effort 1
 _BRANCH = 10  # rows that are tried on each
@@ -290,10 +291,10 @@ class _Search:
         """Give what is finished as it stands, where it must after small moves; None if it does not stand."""
         if Balance(end.blocks, self.levels).stands:
             return end
-        if not self.mendings:
+        if self.mendings <= 0 or len(end.blocks) > _MENDABLE:
             return None
+        self.mendings -= len(end.blocks) ** 2
         moved = steadied(end.blocks, self.levels)
-        self.mendings -= moved is None
         return None if moved is None else replace(end, blocks=moved)
 
     # Beam.

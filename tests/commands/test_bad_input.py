@@ -115,14 +115,16 @@ def black(path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [empty, text, truncated, blank, black, Path.mkdir, lambda path: None])
-def test_a_bad_image_is_named_before_any_work_is_done(
+def test_a_bad_image_is_named_and_the_good_ones_are_answered(
     make: object, cli: Cli, towers: Model, tower_image: Path, tmp_path: Path
 ) -> None:
     bad = tmp_path / "bad.png"
     make(bad)  # type: ignore[operator]
     before = files_below(tmp_path)
-    assert_one_line(cli("sample", tower_image, bad, "--out", tmp_path / "out"), "bad.png")
+    assert_one_line(cli("sample", bad, "--out", tmp_path / "out"), "bad.png")
     assert files_below(tmp_path) == before
+    assert_one_line(cli("sample", tower_image, bad, "--one_shot", "--out", tmp_path / "out"), "bad.png")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["overview.png", "tower"]
 
 
 # Block lists and numbers.
@@ -135,9 +137,9 @@ def test_a_bad_image_is_named_before_any_work_is_done(
         ("cube=-1", "cube=-1"),
         ("cube=1.5", "cube=1.5"),
         ("cube", "cube"),
-        ("cube=11", "1 to 10"),
-        ("cube=0", "1 to 10"),
-        ("", "1 to 10"),
+        ("cube=41", "1 to 40"),
+        ("cube=0", "1 to 40"),
+        ("", "1 to 40"),
     ],
 )
 def test_an_impossible_block_list_is_explained(

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stackgen.api import Model
 from stackgen.commands.cli import VERBS
@@ -20,7 +21,7 @@ from stackgen.models.weights import last_checkpoint
 from stackgen.training.runs import new_run
 from tests.conftest import CHILD, Cli, draw_tower, stacks_json
 
-FILES = ["stack-1.glb", "stack-2.glb", "stacks.json", "stacks.png"]
+FILES = ["overlay.png", "silhouette.png", "stack-1.glb", "stack-2.glb", "stacks.json", "stacks.png"]
 
 
 def names(folder: Path) -> list[str]:
@@ -54,7 +55,7 @@ def test_a_closed_pipe_is_no_error() -> None:
 def test_sample_leaves_file_picture_and_one_glb_per_stack(
     cli: Cli, towers: Model, tower_image: Path, tmp_path: Path
 ) -> None:
-    answer = cli("sample", tower_image, "--num_samples", 2, "--out", tmp_path / "out")
+    answer = cli("sample", tower_image, "--one_shot", "--num_samples", 2, "--out", tmp_path / "out")
     assert answer.code == 0
     assert names(tmp_path / "out") == FILES
     content = read_stacks(tmp_path / "out" / "stacks.json")
@@ -68,14 +69,30 @@ def test_sample_leaves_file_picture_and_one_glb_per_stack(
 
 def test_same_seed_same_bytes_other_seed_others(cli: Cli, towers: Model, tower_image: Path, tmp_path: Path) -> None:
     for folder, seed in (("a", 5), ("b", 5), ("c", 6)):
-        assert cli("sample", tower_image, "--seed", seed, "--out", tmp_path / folder).code == 0
+        assert cli("sample", tower_image, "--one_shot", "--seed", seed, "--out", tmp_path / folder).code == 0
     for name in ("stacks.json", "stacks.png", "stack-1.glb"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
         assert (tmp_path / "a" / name).read_bytes() != (tmp_path / "c" / name).read_bytes()
 
 
+def test_the_best_stacks_of_a_drawing_stand_and_match_at_its_own_scale(cli: Cli, tmp_path: Path) -> None:
+    Image.fromarray(np.pad(np.zeros((60, 60), dtype=np.uint8), 40, constant_values=255)).save(tmp_path / "cube.png")
+    answer = cli("sample", tmp_path / "cube.png", "--out", tmp_path / "out")
+    assert answer.code == 0 and "yes" in answer.out
+    content = read_stacks(tmp_path / "out" / "stacks.json")
+    assert content.block_list_source == "search" and content.stacks[0].names == ["cube"]
+    assert (
+        content.entries[0].matches
+        and json.loads((tmp_path / "out" / "stacks.json").read_text())["stacks"][0]["matches"]
+    )
+    answer = cli("sample", tmp_path / "cube.png", "--cells", "2x6", "--out", tmp_path / "out")
+    content = read_stacks(tmp_path / "out" / "stacks.json")
+    assert answer.code == 0 and content.world.grid.height == 6
+    assert len(content.stacks[0]) == 6 and content.entries[0].matches
+
+
 def test_a_given_block_list_is_used(cli: Cli, towers: Model, tower_image: Path, tmp_path: Path) -> None:
-    cli("sample", tower_image, "--blocks", "cube=1,triangle=1", "--out", tmp_path / "out")
+    cli("sample", tower_image, "--one_shot", "--blocks", "cube=1,triangle=1", "--out", tmp_path / "out")
     content = read_stacks(tmp_path / "out" / "stacks.json")
     assert content.block_list_source == "given"
     assert all(stack.names == ["cube", "triangle"] for stack in content.stacks)
@@ -84,7 +101,7 @@ def test_a_given_block_list_is_used(cli: Cli, towers: Model, tower_image: Path, 
 def test_images_of_one_name_do_not_overwrite_each_other(cli: Cli, towers: Model, tmp_path: Path) -> None:
     (tmp_path / "other").mkdir()
     images = [draw_tower(tmp_path / name) for name in ("a.png", "other/a.png", "b.jpg")]
-    assert cli("sample", *images, "--num_samples", 2, "--out", tmp_path / "out").code == 0
+    assert cli("sample", *images, "--one_shot", "--num_samples", 2, "--out", tmp_path / "out").code == 0
     assert names(tmp_path / "out") == ["a", "a-2", "b", "overview.png"]
     assert all(names(tmp_path / "out" / name) == FILES for name in ("a", "a-2", "b"))
 
@@ -93,7 +110,7 @@ def test_a_smaller_result_leaves_no_glb_of_a_larger_one(
     cli: Cli, towers: Model, tower_image: Path, tmp_path: Path
 ) -> None:
     for number in (3, 2):
-        assert cli("sample", tower_image, "--num_samples", number, "--out", tmp_path / "out").code == 0
+        assert cli("sample", tower_image, "--one_shot", "--num_samples", number, "--out", tmp_path / "out").code == 0
     assert names(tmp_path / "out") == FILES
 
 
@@ -110,7 +127,7 @@ def test_interrupted_sample_leaves_the_finished_images_only(
         return check(stack)  # type: ignore[arg-type]
 
     monkeypatch.setattr(towers.checker, "check", check_until_ctrl_c)
-    answer = cli("sample", *images, "--num_samples", 2, "--out", tmp_path / "out")
+    answer = cli("sample", *images, "--one_shot", "--num_samples", 2, "--out", tmp_path / "out")
     assert answer.code == 130
     assert "interrupted; 1 of 3 images are finished" in answer.line
     assert names(tmp_path / "out") == ["a"]
@@ -133,7 +150,7 @@ def test_check_answers_by_its_exit_code_and_names_what_fell(cli: Cli, stands: Pa
 
 
 def test_check_of_a_sample_finds_the_same_verdicts(cli: Cli, towers: Model, tower_image: Path, tmp_path: Path) -> None:
-    cli("sample", tower_image, "--out", tmp_path / "out")
+    cli("sample", tower_image, "--one_shot", "--out", tmp_path / "out")
     file = tmp_path / "out" / "stacks.json"
     assert cli("check", file, "--out", tmp_path / "again.json").code == 0
     before, after = read_stacks(file), read_stacks(tmp_path / "again.json")
@@ -165,7 +182,7 @@ def test_each_verb_reads_its_own_section_of_a_shared_file(tmp_path: Path) -> Non
 def test_a_section_is_used(cli: Cli, towers: Model, tower_image: Path, tmp_path: Path) -> None:
     shared = tmp_path / "quick.yaml"
     shared.write_text(f"sample: {{seed: 3, num_samples: 2, out: {tmp_path / 'out'}}}\nfit: {{name: quick}}\n")
-    assert cli("sample", tower_image, "--config", shared).code == 0
+    assert cli("sample", tower_image, "--config", shared, "--one_shot").code == 0
     content = read_stacks(tmp_path / "out" / "stacks.json")
     assert (content.seed, len(content.stacks)) == (3, 2)
 

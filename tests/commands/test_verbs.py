@@ -106,7 +106,9 @@ def test_files_are_laid_over_each_other_for_every_verb(cli: Cli, tmp_path: Path)
 def test_what_refers_to_another_option_follows_the_command_line(
     cli: Cli, towers: Model, tower_image: Path, tmp_path: Path
 ) -> None:
-    (tmp_path / "a.yaml").write_text(f"seed: ${{num_samples}}\nnum_samples: 1\nout: {tmp_path / 'out'}\n")
+    (tmp_path / "a.yaml").write_text(
+        f"seed: ${{num_samples}}\nnum_samples: 1\none_shot: true\nout: {tmp_path / 'out'}\n"
+    )
     assert cli("sample", tower_image, "--config", tmp_path / "a.yaml", "--num_samples", 2).code == 0
     content = read_stacks(tmp_path / "out" / "stacks.json")
     assert (content.seed, len(content.stacks)) == (2, 2)
