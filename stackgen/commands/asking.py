@@ -12,14 +12,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from stackgen.api import DEFAULT
 from stackgen.commands.parsing import CONFIG_FLAGS, option_values, own_sections
 from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.errors import StackgenError
 from stackgen.evaluation.protocol import BATCH, Scene, load_scenes
 from stackgen.evaluation.requests import Loaded, Method, load_method, require_one_world
+from stackgen.io.text import parse_yaml, read_text, to_yaml
 from stackgen.training.runs import describe_run, new_run
 
 _OLD_MODEL = "WeightsUnderTest"
@@ -40,7 +39,7 @@ def arguments_of(verb: str, argv: Sequence[str]) -> list[str]:
         content = _content(value)
         if content is not None and is_old_layout(content):
             flag, equals, _ = arguments[index].partition("=")
-            text = yaml.safe_dump(from_old_layout(content), sort_keys=False)
+            text = to_yaml(from_old_layout(content))
             arguments[index] = f"{flag}={text}" if equals and flag in CONFIG_FLAGS else text
     return arguments
 
@@ -48,8 +47,8 @@ def arguments_of(verb: str, argv: Sequence[str]) -> list[str]:
 def _content(value: str) -> dict[str, Any] | None:
     """Read a configuration, given as a file or as its text; None if the parser is to say what is wrong with it."""
     try:
-        content = yaml.safe_load(Path(value).read_text() if value.endswith((".yaml", ".yml")) else value)
-    except (OSError, yaml.YAMLError, UnicodeDecodeError):
+        content = parse_yaml(read_text(value) if value.endswith((".yaml", ".yml")) else value, value)
+    except StackgenError:
         return None
     return content if isinstance(content, dict) else None
 

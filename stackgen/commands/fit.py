@@ -16,7 +16,6 @@ os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # Lightning 2
 os.environ.setdefault("WANDB_SILENT", "true")
 
 import torch
-import yaml
 from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
@@ -27,6 +26,7 @@ from stackgen.commands.parsing import CONFIG_FLAGS, HelpFormatter, epilog, optio
 from stackgen.data.datamodule import StackDataModule
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_json
+from stackgen.io.text import parse_yaml, read_text, to_yaml
 from stackgen.models.weights import CHECKPOINT_KEY, last_checkpoint
 from stackgen.protocols import StabilityChecker
 from stackgen.sim.other_physics import warn_of_other_physics
@@ -212,7 +212,7 @@ class SaveRun(SaveConfigCallback):
         text = self.parser.dump(self.config, skip_none=False)
         data = getattr(trainer, "datamodule", None)
         facts = describe_run(self.folder, text, data.dataset if isinstance(data, StackDataModule) else None)
-        log_configuration(trainer, {**yaml.safe_load(text), "run": facts})
+        log_configuration(trainer, {**parse_yaml(text, "the configuration"), "run": facts})
 
 
 def _with_saved_config(verb: str, arguments: list[str]) -> list[str]:
@@ -223,9 +223,9 @@ def _with_saved_config(verb: str, arguments: list[str]) -> list[str]:
     found = [path for path in map(config_of, checkpoints) if path]
     if not found:
         return arguments
-    saved = yaml.safe_load(renew(found[-1].read_text()))
+    saved = parse_yaml(renew(read_text(found[-1])), found[-1])
     asked = [key for key in saved if key != "ckpt_path"] if verb == "fit" else ["name", "model", "data"]
-    return ["--config", yaml.safe_dump({key: saved[key] for key in asked}), *arguments]
+    return ["--config", to_yaml({key: saved[key] for key in asked}), *arguments]
 
 
 def _check_checkpoint(path: Path) -> None:

@@ -10,13 +10,24 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from jsonargparse import ArgumentError, ArgumentParser, DefaultHelpFormatter, Namespace, set_parsing_settings
+from jsonargparse import (
+    ArgumentError,
+    ArgumentParser,
+    DefaultHelpFormatter,
+    Namespace,
+    get_loader,
+    set_dumper,
+    set_loader,
+    set_parsing_settings,
+)
+from jsonargparse._optionals import get_omegaconf_loader
 from jsonargparse.typing import register_type
 from omegaconf.errors import OmegaConfBaseException
 
 from stackgen.commands.hints import did_you_mean
 from stackgen.commands.old_names import renew
 from stackgen.errors import StackgenError
+from stackgen.io.text import parse_yaml, read_text, to_yaml
 from stackgen.world import Catalogue
 
 
@@ -30,6 +41,10 @@ def _catalogue(value: Any) -> Catalogue:
 # In YAML a catalogue is a list of shapes, and no group of options.
 register_type(Catalogue, Catalogue.to_json, _catalogue)
 set_parsing_settings(subclasses_enabled=[Catalogue])
+# What is saved is read back as it was, and no text of a user's is a bug.
+set_dumper("yaml", to_yaml)
+for _mode, _loader in {"yaml": get_loader("yaml"), "omegaconf+": get_omegaconf_loader("omegaconf+")}.items():
+    set_loader(_mode, _loader, (yaml.YAMLError, ValueError, RecursionError))
 
 CONFIG_FLAGS = ("-c", "--config")
 HELP_OF_ALL = "--help=all"
@@ -134,6 +149,7 @@ class Command:
         parser.add_function_arguments(
             self.function, skip=special, as_group=False, as_positional=False, sub_configs=True
         )
+        _without_underscores(parser)
         return parser
 
     def run(self, argv: Sequence[str]) -> int | None:
@@ -169,6 +185,15 @@ class Command:
             parser.epilog = f"{parser.epilog}\n\n{more}"
 
 
+def _without_underscores(parser: ArgumentParser) -> None:
+    """Spell the option of a parameter that is a word of Python's, such as `as_`, without its underscore."""
+    for action in parser._actions:
+        if action.dest.endswith("_"):
+            action.option_strings = [f"--{action.dest.rstrip('_')}"]
+            action.metavar = action.dest.rstrip("_").upper()
+            parser._option_string_actions[action.option_strings[0]] = action
+
+
 def epilog(example: str) -> str:
     """Lay out command lines as they stand under a help."""
     return "\n".join(["example:", *(f"  {line.strip()}" for line in example.strip().splitlines())])
@@ -199,15 +224,22 @@ def own_sections(verb: str, argv: Sequence[str]) -> list[str]:
     """Replace each `--config FILE` that has a section named like the verb by the text of that section.
 
     So one file can hold the options of several verbs that belong together. Names that classes had before are
-    replaced by those they have now.
+    replaced by those they have now. Files come first: what was typed counts, wherever it stands.
+
+    Raises:
+        StackgenError: If a file is no YAML in UTF-8, or holds no options.
     """
     arguments = [renew(argument) for argument in argv]
+    files: list[int] = []
     for index, value in option_values(arguments, CONFIG_FLAGS):
-        text = _own_text(Path(value), verb)
+        flag, equals, _ = arguments[index].partition("=")
+        joined = bool(equals) and flag in CONFIG_FLAGS
+        text = _own_text(value, verb)
         if text is not None:
-            flag, equals, _ = arguments[index].partition("=")
-            arguments[index] = f"{flag}={text}" if equals and flag in CONFIG_FLAGS else text
-    return arguments
+            arguments[index] = f"{flag}={text}" if joined else text
+        files += [index] if joined else [index - 1, index]
+    typed = [argument for index, argument in enumerate(arguments) if index not in files]
+    return [*(arguments[index] for index in files), *typed]
 
 
 def option_values(arguments: Sequence[str], flags: Sequence[str]) -> list[tuple[int, str]]:
@@ -226,16 +258,20 @@ def option_values(arguments: Sequence[str], flags: Sequence[str]) -> list[tuple[
     return found
 
 
-def _own_text(file: Path, verb: str) -> str | None:
+def _own_text(value: str, verb: str) -> str | None:
     """Give the text that is to stand in the place of a configuration file; None for the file as it is."""
     try:
-        written = file.read_text() if file.is_file() else ""
-        content = yaml.safe_load(text := renew(written))
-    except (OSError, yaml.YAMLError, UnicodeDecodeError):  # text instead of a file may be too long for a path
-        return None  # the parser will say so
-    if isinstance(content, dict) and isinstance(content.get(verb), dict):
-        return yaml.safe_dump(content[verb], sort_keys=False)
-    return text if text != written else None
+        if not Path(value).is_file():
+            return None
+    except OSError:  # text instead of a file may be too long for a path
+        return None
+    text = renew(written := read_text(value))
+    content = parse_yaml(text, value)
+    if not isinstance(content, dict):
+        raise StackgenError(f"--config {value}: it holds no options, which are written as `name: value`")
+    if isinstance(content.get(verb), dict):
+        return to_yaml(content[verb])
+    return text if text != written or not text.isascii() else None  # others read files in the encoding of the machine
 
 
 _NOISE = re.compile(
