@@ -41,7 +41,8 @@ class Shape:
         depth: Extent along y [cell].
 
     Raises:
-        StackgenError: If the outline is not convex, not counter-clockwise or not centred.
+        StackgenError: If the name could not stand in a block list or a program, or the outline is not convex, not
+            counter-clockwise or not centred.
 
     >>> Shape("plank", ((-1, -0.25), (1, -0.25), (1, 0.25), (-1, 0.25))).size
     (2.0, 1.0, 0.5)
@@ -52,6 +53,11 @@ class Shape:
     depth: float = 1.0
 
     def __post_init__(self) -> None:
+        if not (isinstance(self.name, str) and self.name.isprintable() and re.fullmatch(r"[^\s,=]{1,100}", self.name)):
+            raise StackgenError(
+                "catalogue: a shape's name is 1 to 100 printable characters without spaces, commas and equals signs, got"
+                f" {_short(self.name)}"
+            )
         corners = np.asarray(self.outline, dtype=float)
         if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
             raise self._refused("must be at least three (x, z) corners, finite numbers")
@@ -234,8 +240,6 @@ def _shape_from_config(item: str | Mapping) -> Shape:
             f" got {_short(item)}"
         )
     name = item["name"]
-    if not isinstance(name, str) or not re.fullmatch(r"[A-Za-z]\w{0,99}", name, re.ASCII):
-        raise StackgenError(f"catalogue: a shape's name is letters, digits and _, from a letter on, got {_short(name)}")
     try:
         if "width" in item:
             extents = [float(item.get(key, 1)) for key in ("width", "height", "depth")]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+from rich.markup import escape
 from rich.table import Table
 
 from stackgen.io.stacks_file import StackEntry
@@ -31,12 +32,12 @@ def verdict_table(heading: str, sources: Iterable[tuple[str, Sequence[StackEntry
         for number, entry in enumerate(entries, 1):
             stands = entry.verdict is not None and entry.verdict.stable
             table.add_row(
-                source if number == 1 else "",
+                escape(source) if number == 1 else "",
                 str(number),
                 STANDS if stands else FALLS,
                 "" if entry.front_iou is None else f"{entry.front_iou:.2f}",
                 "" if entry.matches is None else "yes" if entry.matches else "no",
-                describe_fall(entry.stack, entry.verdict, most) if entry.verdict else "",
+                escape(describe_fall(entry.stack, entry.verdict, most)) if entry.verdict else "",
             )
     return table
 

@@ -84,11 +84,11 @@ class UrScriptFile:
 
     def say(self, line: str) -> None:
         """Write a line."""
-        self.lines.append(_INDENT + line)
+        self.lines.append(_INDENT + one_line(line))
 
     def comment(self, text: str) -> None:
         """Write a comment."""
-        self.lines.append(f"{_INDENT}# {text}".rstrip() if text else "")
+        self.lines.append(f"{_INDENT}# {one_line(text)}".rstrip() if text else "")
 
     @property
     def _robotiq(self) -> bool:
@@ -102,7 +102,7 @@ class UrScriptFile:
         """
         head = [
             "def stackgen_build():",
-            f"{_INDENT}# {title}",
+            f"{_INDENT}# {one_line(title)}",
             f"{_INDENT}# Written by stackgen for this workcell alone: read it, and run it slowly the first time.",
             f"{_INDENT}# Poses are those of the finger tips in the controller's base frame [m, rad].",
             f"{_INDENT}set_tcp(p{numbers(np.array(tool_offset(self.workcell)))})",
@@ -232,3 +232,12 @@ def jaws_close():
   sleep(@SECONDS@)
 end
 """
+
+
+def one_line(text: str) -> str:
+    """Write text so that it cannot end the line it stands in: what is not printable becomes a question mark.
+
+    >>> one_line("a house\\n  movej([0])")
+    'a house?  movej([0])'
+    """
+    return "".join(character if character.isprintable() else "?" for character in text)
