@@ -66,11 +66,13 @@ def warm_runs(options: argparse.Namespace, folder: Path) -> tuple[float, dict[st
     begin = time.perf_counter()
     from stackgen.api import check, load
     from stackgen.commands.sample import write_result
+    from stackgen.vision.reader import read_picture
 
     image, n = ROOT / options.image, options.num_samples
     model = load(options.weights, options.block_list_weights)
     result = model.sample_checked(image, n, 0, options.blocks)
-    write_result(result, folder)
+    overlay = read_picture(image, model.world.grid).overlay
+    write_result(result, folder, overlay)
     first_call = time.perf_counter() - begin
 
     mask, counts = model.read(image), result.block_list
@@ -80,7 +82,7 @@ def warm_runs(options: argparse.Namespace, folder: Path) -> tuple[float, dict[st
         "block list": lambda: options.blocks or model.predictor.predict(mask[None]),
         "sampler": lambda: model.sampler.sample_batch(mask[None], counts[None], n, 0),
         "physics": lambda: [check(model.checker, stack, mask, model.world.grid) for stack in result.stacks],
-        "drawing and files": lambda: write_result(result, folder),
+        "drawing and files": lambda: write_result(result, folder, overlay),
     }
     return first_call, {name: repeated(stage, options.runs) for name, stage in stages.items()}, peak_rss_mb()
 

@@ -55,7 +55,7 @@ class Shape:
     def __post_init__(self) -> None:
         if not (isinstance(self.name, str) and self.name.isprintable() and re.fullmatch(r"[^\s,=]{1,100}", self.name)):
             raise StackgenError(
-                "catalogue: a shape's name is 1 to 100 printable characters without spaces, commas and equals signs, got"
+                "catalogue: a shape's name is 1 to 100 printable characters, no space, comma or equals sign, got"
                 f" {_short(self.name)}"
             )
         corners = np.asarray(self.outline, dtype=float)

@@ -18,7 +18,10 @@ from stackgen.sim.checkers import SimulatorChecker
 from stackgen.stack import Stack, layout
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Catalogue, Grid, Shape, World
 
-HOUSE = Stack([1, 0, 0, 3, 3], [[0, 0, 0.5, 0, 0, 0]] + [[x, 0, z, 0, 0, 0] for z in (1.5, 2.5) for x in (-0.5, 0.5)])
+HOUSE = Stack(
+    np.array([1, 0, 0, 3, 3]),
+    np.array([[0, 0, 0.5, 0, 0, 0]] + [[x, 0, z, 0, 0, 0] for z in (1.5, 2.5) for x in (-0.5, 0.5)]),
+)
 TARGET = silhouette(HOUSE, PAPER_GRID)
 
 
@@ -54,7 +57,8 @@ def test_no_combination_is_better_on_a_small_world(seed: int) -> None:
     target[10:14, 4:8] = True
     levels = Levels(target, world)
     best = -np.inf
-    rows = [()] + [((s, a),) for s, a in product(range(2), range(16))]
+    rows: list[tuple[tuple[int, int], ...]] = [()]
+    rows += [((s, a),) for s, a in product(range(2), range(16))]
     rows += [((0, a), (0, b)) for a in range(12) for b in range(a + 4, 13)]
     rows = [row for row in rows if all(a + levels.pieces[s].width <= 16 for s, a in row)]
     for lower in filter(None, rows):
@@ -73,7 +77,8 @@ def test_no_combination_is_better_on_a_small_world(seed: int) -> None:
 def test_planks_and_cubes_stand_in_rows_of_their_own_heights() -> None:
     catalogue = Catalogue((Shape.box("cube", 1), Shape.box("plank", 3, 0.5)))
     world = World(catalogue, PAPER_GRID, 10)
-    table = Stack([0, 0, 1], [[-1, 0, 0.5, 0, 0, 0], [1, 0, 0.5, 0, 0, 0], [0, 0, 1.25, 0, 0, 0]], catalogue)
+    poses = np.array([[-1, 0, 0.5, 0, 0, 0], [1, 0, 0.5, 0, 0, 0], [0, 0, 1.25, 0, 0, 0]])
+    table = Stack(np.array([0, 0, 1]), poses, catalogue)
     found = solve(silhouette(table, PAPER_GRID), world)
     assert found[0].iou > 0.97 and found[0].stack.counts.tolist() == [2, 1]
 

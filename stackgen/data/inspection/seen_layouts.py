@@ -1,7 +1,7 @@
 """Which stacks of one set have a layout that another set holds too: what a network may have learnt by heart.
 
 Two notions of "the same", from coarse to fine. The *layout* is that of
-:func:`stackgen.sampling.feasible.layout`, by which the paper counts diversity: the shapes of each
+:func:`stackgen.stack.layout`, by which the paper counts diversity: the shapes of each
 layer from left to right. The *design* adds the cell in which each block begins, and leaves out displacement
 and settling alone; the `layout` of a sample's metadata is one.
 

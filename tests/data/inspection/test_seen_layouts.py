@@ -12,8 +12,7 @@ from stackgen.data.generation.designs import Design
 from stackgen.data.inspection.seen_layouts import layout_codes, seen_layouts
 from stackgen.data.shards import Sample
 from stackgen.geometry import mirror
-from stackgen.sampling.feasible import layout
-from stackgen.stack import Stack
+from stackgen.stack import Stack, layout
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD
 
 Samples = dict[str, list[Sample]]
