@@ -11,6 +11,7 @@ from typing import Any
 
 from stackgen.data.manifest import FORMAT, SPLITS, Manifest
 from stackgen.io.files import write_atomically
+from stackgen.io.text import in_markdown
 
 CARD = "README.md"
 MARK = "<!-- Dataset card, written by stackgen: what is changed here by hand is lost when it is written again. -->"
@@ -76,7 +77,7 @@ def dataset_card(manifest: Manifest, measured: Sequence[str] = ()) -> str:
     }
     if measured:
         sections["What is in it"] = "\n\n".join(measured)
-    title = f"# {manifest.name}: {stacks:,} stacks of blocks that stand"
+    title = f"# {in_markdown(manifest.name)}: {stacks:,} stacks of blocks that stand"
     parts = [MARK, title, *(f"## {name}\n\n{text}" if name else text for name, text in sections.items())]
     return "\n\n".join(parts) + "\n"
 
@@ -136,14 +137,14 @@ def _making(manifest: Manifest) -> str:
 
 def _blocks(manifest: Manifest) -> str:
     rows = [
-        [f"{index}: {shape.name}", *(f"{extent:g}" for extent in shape.size), f"{shape.volume:g}"]
+        [f"{index}: {in_markdown(shape.name)}", *(f"{extent:g}" for extent in shape.size), f"{shape.volume:g}"]
         for index, shape in enumerate(manifest.world.catalogue)
     ]
     return markdown_table(["shape", "width [cell]", "depth [cell]", "height [cell]", "volume [cell^3]"], rows)
 
 
 def _physics(manifest: Manifest) -> str:
-    rows = [[name, _number(value)] for name, value in manifest.physics.items()]
+    rows = [[in_markdown(name), in_markdown(_number(value))] for name, value in manifest.physics.items()]
     return (
         "A verdict holds for these numbers alone; lengths in metres unless stackgen's docs/physics.md says cells.\n\n"
         + markdown_table(["setting", "value"], rows)

@@ -230,8 +230,13 @@ def write_csv(path: str | Path, rows: Sequence[Mapping[str, Any]]) -> None:
     buffer = io.StringIO()
     writer = csv.DictWriter(buffer, rows[0].keys(), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows({name: _no_formula(value) for name, value in row.items()} for row in rows)
     write_atomically(path, buffer.getvalue().encode())
+
+
+def _no_formula(value: Any) -> Any:
+    """Keep a spreadsheet from taking text for a formula; numbers stay as they are."""
+    return f"'{value}" if isinstance(value, str) and value[:1] in ("=", "+", "-", "@", "\t", "\r") else value
 
 
 def _sample_rows(scene: SceneResult) -> Iterator[dict[str, Any]]:

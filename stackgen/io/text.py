@@ -108,6 +108,30 @@ def to_yaml(content: Any) -> str:
     return yaml.dump(content, Dumper=_Dumper, default_flow_style=False, allow_unicode=True, sort_keys=False)
 
 
+def printable(text: object) -> str:
+    """Write text so that it stays in its line and moves no cursor: what is not printable is shown as its escape.
+
+    >>> printable("a house\\n\\x1b[2J")
+    'a house\\\\n\\\\x1b[2J'
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "backslashreplace").decode() for c in str(text))
+
+
+def in_markdown(text: object) -> str:
+    """Write text so that a reader of Markdown shows it as it is.
+
+    >>> in_markdown("a|b <b>")
+    'a&#124;b &lt;b&gt;'
+    """
+    special = {"&": "&amp;", "<": "&lt;", ">": "&gt;", "|": "&#124;", "`": "&#96;", "[": "&#91;", "*": "&#42;"}
+    return "".join(special.get(c, c) for c in printable(text))
+
+
+def in_a_plot(text: object) -> str:
+    """Write text so that matplotlib draws it as it is, dollar signs too."""
+    return printable(text).replace("$", r"\$")
+
+
 class _Loader(yaml.SafeLoader):
     """YAML 1.1 as PyYAML reads it, with the numbers of YAML 1.2 and without dates."""
 

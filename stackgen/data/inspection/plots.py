@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stackgen.data.card import markdown_table
 from stackgen.data.inspection.contents import SAME, Contents, distributions
 from stackgen.io.files import write_atomically
+from stackgen.io.text import in_a_plot, in_markdown
 from stackgen.viz.render import Picture, contact_sheet
 
 if TYPE_CHECKING:
@@ -53,14 +54,14 @@ def draw_facts(path: Path, contents: Contents, found: Mapping[str, Any], margins
         _histogram(place, name, values)
     for place in places[len(bars) + len(curves) :]:
         place.set_axis_off()
-    figure.suptitle(f"{found['name']}: {found['stacks']:,} stacks", color=_INK)
+    figure.suptitle(in_a_plot(f"{found['name']}: {found['stacks']:,} stacks"), color=_INK)
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=110, metadata={"Software": None})
     write_atomically(path, data.getvalue())
 
 
 def _bars(axes: Axes, name: str, tally: Mapping[str, int]) -> None:
-    bars = axes.bar(list(tally), list(tally.values()), color=_BAR)
+    bars = axes.bar([in_a_plot(name) for name in tally], list(tally.values()), color=_BAR)
     axes.bar_label(bars, [f"{n:,}" for n in tally.values()], fontsize=7, color=_INK)
     _style(axes, name)
 
@@ -110,7 +111,7 @@ def paragraphs(found: Mapping[str, Any], pictures: Sequence[str] = ()) -> list[s
 
 
 def _tally(name: str, tally: Mapping[str, int]) -> str:
-    return markdown_table([name, *tally], [["number", *(f"{n:,}" for n in tally.values())]])
+    return markdown_table([name, *map(in_markdown, tally)], [["number", *(f"{n:,}" for n in tally.values())]])
 
 
 def _distributions(found: Mapping[str, Any]) -> str:

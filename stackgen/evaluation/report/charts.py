@@ -15,6 +15,7 @@ from stackgen.evaluation.report.results import ALL, Result
 from stackgen.evaluation.report.rows import LIST_NAMES
 from stackgen.evaluation.results import PREDICTED_LIST, TRUE_LIST
 from stackgen.io.files import write_atomically
+from stackgen.io.text import in_a_plot
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -131,7 +132,7 @@ def _estimate(result: Result, metric: str) -> Estimate | None:
 
 
 def _finish(panel: Axes, names: Sequence[str], heading: str) -> None:
-    panel.set_xticks(range(len(names)), [textwrap.fill(name, 14) for name in names], fontsize=8)
+    panel.set_xticks(range(len(names)), [textwrap.fill(in_a_plot(name), 14) for name in names], fontsize=8)
     panel.set_xlim(-0.6, len(names) - 0.4)
     panel.set_ylim(0, 105)
     panel.set_ylabel(heading, fontsize=9)

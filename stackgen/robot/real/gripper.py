@@ -17,6 +17,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from stackgen.errors import StackgenError
+from stackgen.robot.real.program import check_host
 
 PORT = 63352
 POSITIONS = 255
@@ -56,6 +57,7 @@ class Gripper:
     seconds: float = 1.0
 
     def __post_init__(self) -> None:
+        check_host("gripper", self.host)
         for name in ("stroke", "strongest", "seconds"):
             if not 0 < getattr(self, name) < np.inf:
                 raise StackgenError(f"gripper: {name} must be positive, got {getattr(self, name):g}")

@@ -7,6 +7,7 @@ was calibrated, on a path that differs from the checked one by no more than the 
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Literal
 
@@ -30,6 +31,19 @@ _SLACK = 1e-6
 _SLOWEST = 0.002  # that the controller is ever asked for [m/s, rad/s]
 
 
+_HOST = re.compile(r"[A-Za-z0-9._:%-]{0,253}")
+
+
+def check_host(what: str, host: str) -> None:
+    """See that an address is a name or a number, for it stands in the robot's program.
+
+    Raises:
+        StackgenError: If it is anything else.
+    """
+    if not _HOST.fullmatch(host):
+        raise StackgenError(f"{what}: host must be a name or an address of letters, digits and .:-, got {host!r:.60}")
+
+
 @dataclass(frozen=True)
 class Controller:
     """The real arm's controller, and what hangs on its flange.
@@ -50,6 +64,9 @@ class Controller:
     agreement: float = 0.01
 
     def __post_init__(self) -> None:
+        check_host("controller", self.host)
+        if not np.isfinite(self.center_of_gravity).all():
+            raise StackgenError("controller: center_of_gravity must be three finite numbers")
         for name in ("payload", "near_home", "agreement"):
             if not 0 < getattr(self, name) < np.inf:
                 raise StackgenError(f"controller: {name} must be positive, got {getattr(self, name):g}")

@@ -18,6 +18,7 @@ from scipy.spatial import ConvexHull
 
 from stackgen.errors import StackgenError, require
 from stackgen.io.files import write_atomically
+from stackgen.io.text import in_a_plot
 from stackgen.robot.planning.clearance import block_corners
 from stackgen.robot.planning.staging import Waiting, lay_out
 from stackgen.robot.workcell import Workcell, pose
@@ -206,7 +207,7 @@ def _draw(axes: Axes, place: SlotDrawing, font: float) -> None:
     middle = (place.outline.min(axis=0) + place.outline.max(axis=0)) / 2
     axes.text(middle[0], middle[1], f"{place.slot}", ha="center", va="center", fontsize=2 * font, clip_on=True)
     corner = place.border.min(axis=0)
-    text = f"slot {place.slot}: block {place.block}, {place.shape}"
+    text = in_a_plot(f"slot {place.slot}: block {place.block}, {place.shape}")
     axes.text(corner[0] + 3, corner[1] + 3, text, va="bottom", fontsize=0.7 * font, clip_on=True)
     sketch = place.front * _SKETCH
     at = np.array([place.border[:, 0].min(), place.border[:, 1].max()])

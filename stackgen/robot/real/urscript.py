@@ -127,7 +127,7 @@ class UrScriptFile:
         for part in parts:
             text = part
             for name, value in values.items():
-                text = text.replace(f"@{name}@", value)
+                text = text.replace(f"@{name}@", one_line(value))
             head += ["", *(_INDENT + line if line else "" for line in text.strip("\n").split("\n"))]
         return "\n".join([*head, *self.lines, f'{_INDENT}textmsg("stackgen: done")', "end", ""])
 

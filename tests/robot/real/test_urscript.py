@@ -1,16 +1,28 @@
 """The program: poses in the controller's base, balanced blocks of text, within the limits, for both kinds of jaws."""
 
+import csv
+import json
 import re
 from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
+from stackgen.data.card import dataset_card
+from stackgen.data.manifest import Manifest
 from stackgen.errors import StackgenError
+from stackgen.evaluation.results import write_csv
 from stackgen.robot.planning.motion import Close, Motion, Open, joint_motion
 from stackgen.robot.real.gripper import Gripper
 from stackgen.robot.real.program import Controller, controller_move, controller_pose, tool_offset
+from stackgen.robot.real.staging_sheet import write_staging_sheet
 from stackgen.robot.real.urscript import urscript
+from stackgen.stack import Stack
+from stackgen.viz.gltf import glb_bytes
+from stackgen.viz.page import html_page
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Catalogue, World
 from tests.robot.real import standin
 from tests.robot.real.arms import WORKCELL, plan
 
@@ -90,3 +102,57 @@ def test_a_motion_that_is_too_fast_is_refused() -> None:
     with pytest.raises(StackgenError, match="transit would be too fast"):
         controller_move(motion, slow)
     assert controller_move(motion, WORKCELL).speed <= np.radians(WORKCELL.speeds.joint)
+
+
+HOSTILE = 'x$\\frac{"];</script><b>|[red]&#movej(p)'
+"""A name that is one printable word, and code in more than one language."""
+
+EVIL = Catalogue(tuple(replace(shape, name=f"{HOSTILE}{i}") for i, shape in enumerate(PAPER_CATALOGUE)))
+
+
+def test_a_block_s_name_is_only_ever_a_comment_of_the_program() -> None:
+    named = replace(plan(), stack=Stack(plan().stack.shapes, plan().stack.poses, EVIL))
+    text = urscript(named, WORKCELL, Controller(), Gripper())
+
+    def code(program: str) -> list[str]:
+        return [line.partition("#")[0].rstrip() for line in program.splitlines()]
+
+    assert code(text) == code(program()) and HOSTILE in text
+
+
+@pytest.mark.parametrize("host", ['x", 1, "jaws")\n movej([0])', "a b", "@PORT@", "\x1b[2J", "a" * 300])
+def test_an_address_that_could_be_code_is_refused(host: str) -> None:
+    for kind in (Controller, Gripper):
+        with pytest.raises(StackgenError, match="host must be") as refused:
+            kind(host=host)
+        assert str(refused.value).isprintable()
+
+
+def test_no_number_of_the_program_is_nan() -> None:
+    with pytest.raises(StackgenError, match="finite"):
+        Controller(center_of_gravity=(0.0, float("nan"), 0.0))
+
+
+@pytest.mark.parametrize("suffix", [".svg", ".pdf"])
+def test_a_name_is_text_on_the_staging_sheet(suffix: str, tmp_path: Path) -> None:
+    stack = Stack(plan().stack.shapes, plan().stack.poses, EVIL)
+    write_staging_sheet(tmp_path / f"a{suffix}", stack, order=(0, 1), workcell=WORKCELL, cell_size=0.05)
+    content = (tmp_path / f"a{suffix}").read_bytes()
+    assert b"<b>" not in content and b"</script>" not in content
+    if suffix == ".svg":
+        ElementTree.fromstring(content)
+
+
+def test_a_name_is_text_in_pages_models_cards_and_tables(tmp_path: Path) -> None:
+    stack = Stack(plan().stack.shapes, plan().stack.poses, EVIL)
+    page = html_page([stack], title=HOSTILE)
+    assert page.count("</script>") == html_page([plan().stack]).count("</script>") and "<b>" not in page
+    glb = glb_bytes(stack)
+    size = int.from_bytes(glb[12:16], "little")
+    assert json.loads(glb[20 : 20 + size])["nodes"][0]["name"] == f"0 {HOSTILE}0"
+    world = World(EVIL, PAPER_GRID, 10)
+    manifest = Manifest(f"a\n# b {HOSTILE}", 0, world, {"engine": "<b>|"}, {})
+    card = dataset_card(manifest)
+    assert "<b>" not in card and "\n# b" not in card and "</script>" not in card
+    write_csv(tmp_path / "a.csv", [{"method": '=HYPERLINK("x")', "value": -0.5}])
+    assert list(csv.reader((tmp_path / "a.csv").open()))[1] == ['\'=HYPERLINK("x")', "-0.5"]
