@@ -1,7 +1,7 @@
-"""Agreement of the project's physics, and of the statics of its generator, with two slower simulations.
+"""Agreement of the project's physics, and of the statics of its generator, with two slower simulations and MuJoCo.
 
 The slow one has PyBullet's usual step: 4 s at 240 Hz with 50 iterations, never stopped early. The fine one, 4 s at
-960 Hz with 200 iterations, says which of the two is nearer to the truth. All disagreements are listed.
+960 Hz with 200 iterations, says which of the others is nearer to the truth. All disagreements are listed.
 """
 
 from __future__ import annotations
@@ -28,15 +28,19 @@ from stackgen.sim.statics.plane import PlaneStatics, StaticsMargins
 from stackgen.stack import Stack
 from stackgen.world import PAPER_GRID, PAPER_WORLD
 
-SLOW = Physics(time_step=1 / 240, solver_iterations=50, watch=4.0, rest_window=8.0)
+SLOW = Physics(engine="bullet", time_step=1 / 240, solver_iterations=50, watch=4.0, rest_window=8.0)
 """Its window of rest is longer than its watch: it never stops early."""
 
-FINE = Physics(time_step=1 / 960, solver_iterations=200, rest_window=0.25, rest_motion=2e-4, watch=4.0)
+FINE = Physics(engine="bullet", time_step=1 / 960, solver_iterations=200, rest_window=0.25, rest_motion=2e-4, watch=4.0)
 """Twice the steps of the project's physics, three times the iterations, a stricter rest and twice the watch.
 
 Few stacks rest by its standard (Bullet's contacts tremble by more than that); what counts is where the
 blocks are when its watch is over.
 """
+
+FAST = Physics(engine="bullet")
+MUJOCO = Physics(engine="mujoco")
+SIMULATIONS = {"fast": FAST, "slow": SLOW, "fine": FINE, "mujoco": MUJOCO}
 
 
 @dataclass(frozen=True)
@@ -59,7 +63,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Draw stacks, simulate them in three ways, count how often these agree."""
+    """Draw stacks, simulate them in four ways, count how often these agree."""
     options = parser().parse_args()
     if options.number < 1 or options.workers < 1:
         raise StackgenError("--number and --workers must be at least 1")
@@ -67,9 +71,7 @@ def main() -> None:
     with ProcessPoolExecutor(options.workers, get_context("spawn")) as pool:
         answers = list(track(pool.map(answer, asked, chunksize=4), "simulating", total=len(asked)))
     metrics = {
-        "fast": Physics().to_json(),
-        "slow": SLOW.to_json(),
-        "fine": FINE.to_json(),
+        **{name: physics.to_json() for name, physics in SIMULATIONS.items()},
         "certificate": vars(StaticsMargins()),
         **count(asked, answers),
     }
@@ -129,7 +131,7 @@ def samples(stacks: Sequence[Stack], weights: str, seed: int) -> list[Stack]:
 def answer(case: Case) -> dict[str, Any]:
     """Whether the stack falls in each simulation, whether fast and fine accept it, and what statics is certain of."""
     found: dict[str, Any] = {}
-    for name, physics in (("fast", Physics()), ("slow", SLOW), ("fine", FINE)):
+    for name, physics in SIMULATIONS.items():
         simulator = _SIMULATORS.setdefault(physics, Simulator(physics))
         rollout = simulator.rollout(case.stack, until_fall=physics is not SLOW)
         found[name] = bool(fell(rollout, physics).any())
@@ -143,14 +145,18 @@ def answer(case: Case) -> dict[str, Any]:
     return found
 
 
-COUNTED = ("number", "fall", "fast_slow", "fast_fine", "slow_fine", "accept_fast_fine", "certain", "certain_wrong")
+PAIRS = (("fast", "slow"), ("fast", "fine"), ("slow", "fine"), ("mujoco", "fast"), ("mujoco", "fine"))
+COUNTED = (
+    *("number", "fall", "mujoco_fall", *("_".join(pair) for pair in PAIRS)),
+    *("accept_fast_fine", "accept_mujoco_fast", "certain", "certain_wrong"),
+)
 
 _SIMULATORS: dict[Physics, Simulator] = {}
 
 
 def disputed(found: dict[str, Any]) -> bool:
-    """Whether the three simulations disagree."""
-    return not found["fast"] == found["slow"] == found["fine"]
+    """Whether the simulations disagree."""
+    return len({found[name] for name in SIMULATIONS}) > 1
 
 
 def wrong(found: dict[str, Any]) -> bool:
@@ -166,10 +172,11 @@ def count(asked: Sequence[Case], answers: Sequence[dict[str, Any]]) -> dict[str,
             row = stages.setdefault(stage, dict.fromkeys(COUNTED, 0))
             row["number"] += 1
             row["fall"] += found["fine"]
-            row["fast_slow"] += found["fast"] == found["slow"]
-            row["fast_fine"] += found["fast"] == found["fine"]
-            row["slow_fine"] += found["slow"] == found["fine"]
+            row["mujoco_fall"] += found["mujoco"]
+            for one, other in PAIRS:
+                row[f"{one}_{other}"] += found[one] == found[other]
             row["accept_fast_fine"] += found["fast_accepts"] == found["fine_accepts"]
+            row["accept_mujoco_fast"] += found["mujoco_accepts"] == found["fast_accepts"]
             row["certain"] += found["statics"] in ("stands", "falls")
             row["certain_wrong"] += wrong(found)
     stages["all"] = stages.pop("all")
@@ -189,17 +196,16 @@ def tables(metrics: dict[str, Any]) -> list[Any]:
         + [str(row["certain_wrong"])]
         for stage, row in metrics["stages"].items()
     ]
-    agreements = ("fast = slow", "fast = fine", "slow = fine", "both accept or neither")
-    headings = ("stage", "stacks", "fall", *agreements, "statics certain", "and wrong")
+    agreements = (*(" = ".join(pair) for pair in PAIRS), "accept: fast = fine", "accept: mujoco = fast")
+    headings = ("stage", "stacks", "fall", "in mujoco", *agreements, "statics certain", "and wrong")
     words = {True: "falls", False: "stands"}
     disputes = [
-        [f"{d['stage']} {d['number']}", str(d["blocks"]), *(words[d[name]] for name in ("fast", "slow", "fine"))]
-        + [d["statics"]]
+        [f"{d['stage']} {d['number']}", str(d["blocks"]), *(words[d[name]] for name in SIMULATIONS)] + [d["statics"]]
         for d in metrics["disagreements"]
     ]
     return [
-        plain_table("Fast against slow and fine", headings, rows),
-        plain_table("Disagreements", ("case", "blocks", "fast", "slow", "fine", "statics"), disputes),
+        plain_table("Fast against slow, fine and mujoco", headings, rows),
+        plain_table("Disagreements", ("case", "blocks", *SIMULATIONS, "statics"), disputes),
     ]
 
 

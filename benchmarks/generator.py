@@ -47,7 +47,7 @@ class Counting(Simulator):
         rollout = super().rollout(stack, **options)
         self.seconds += time.process_time() - begin
         self.rollouts += 1
-        self.steps += round(rollout.time / self.physics.time_step)
+        self.steps += round(rollout.time / self.physics.step)
         return rollout
 
 

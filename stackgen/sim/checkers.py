@@ -41,10 +41,10 @@ def fell(rollout: Rollout, physics: Physics) -> NDArray[np.bool_]:
 
 
 class SimulatorChecker:
-    """A StabilityChecker that asks PyBullet.
+    """A StabilityChecker that asks an engine, Bullet or MuJoCo.
 
     Args:
-        physics: Numbers of the physics; the project's own by default.
+        physics: Numbers of the physics, and the engine; the project's own by default.
         until_fall: End a rollout at the first fall: the same verdicts, sooner; but the settled
             poses of unstable stacks are then those of that moment.
     """

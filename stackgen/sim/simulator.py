@@ -1,20 +1,16 @@
-"""PyBullet: put a stack down, let time pass, say where the blocks went.
+"""Put a stack down, let time pass, say where the blocks went.
 
-One client of PyBullet serves for any number of stacks, since opening one costs 25 ms and 34 MB: the
-blocks of the last rollout are removed, which drops their contacts, and new ones are created in an order
-of their own. Overlapping pairs are sorted. So a rollout depends on the stack alone: not on what was
-simulated before, nor on the order of its blocks (tests/sim).
+One engine serves for any number of stacks. Their blocks are put down in an order of their own, so a
+rollout depends on the stack alone: not on what was simulated before, nor on the order of its blocks
+(tests/sim).
 """
 
 from __future__ import annotations
 
-import contextlib
-import os
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,23 +23,41 @@ from stackgen.world import Shape
 Floats = NDArray[np.float64]
 
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Silence what native code prints: PyBullet greets at import, on the error stream."""
-    sys.stderr.flush()
-    saved, null = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    os.dup2(null, 2)
-    try:
-        yield
-    finally:
-        sys.stderr.flush()
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(null)
+class Engine(Protocol):
+    """What computes how blocks move; `bullet_engine` and `mujoco_engine` have one each."""
+
+    def put(self, shapes: Sequence[Shape], positions: Floats, quaternions: Floats) -> None:
+        """Put blocks on an empty ground, at rest.
+
+        Args:
+            shapes: The k shapes.
+            positions: (k, 3) centres of mass [m].
+            quaternions: (k, 4) orientations (x, y, z, w).
+        """
+        ...
+
+    def step(self, number: int) -> None:
+        """Let a number of steps pass."""
+        ...
+
+    def states(self) -> Floats:
+        """Read centres of mass [m] and quaternions, (k, 7)."""
+        ...
+
+    def close(self) -> None:
+        """Give the memory back."""
+        ...
 
 
-with _quiet():
-    import pybullet as bullet
+def open_engine(physics: Physics) -> Engine:
+    """Open the engine that a physics names; only that one is imported."""
+    if physics.engine == "mujoco":
+        from stackgen.sim.mujoco_engine import MujocoEngine
+
+        return MujocoEngine(physics)
+    from stackgen.sim.bullet_engine import BulletEngine
+
+    return BulletEngine(physics)
 
 
 @dataclass(frozen=True)
@@ -81,7 +95,7 @@ class Simulator:
 
     def __init__(self, physics: Physics | None = None) -> None:
         self.physics = physics or Physics()
-        self._client: _Client | None = None
+        self._engine: Engine | None = None
 
     def rollout(
         self, stack: Stack, *, until_fall: bool = False, until_moved: float = np.inf, record_every: int = 0
@@ -94,20 +108,21 @@ class Simulator:
             until_moved: End as soon as a block moved further than this from its start [cell].
             record_every: Keep every n-th step's poses in the trajectory; 0 keeps none.
         """
-        if self._client is None:
-            self._client = _Client(self.physics)
+        if self._engine is None:
+            self._engine = open_engine(self.physics)
         order = np.lexsort((*stack.poses.T, stack.shapes))  # the order of the blocks must not matter
-        self._client.put([stack.catalogue[shape] for shape in stack.shapes[order]], stack.poses[order])
-        poses, at_rest, steps, frames = self._client.run(until_fall, until_moved, record_every)
+        shapes = [stack.catalogue[shape] for shape in stack.shapes[order]]
+        watch = _Watch(self._engine, self.physics, shapes, stack.poses[order])
+        poses, at_rest, steps, frames = watch.run(until_fall, until_moved, record_every)
         back = np.argsort(order)
         trajectory = np.array([frame[back] for frame in frames]) if record_every else None
-        return Rollout(stack, stack.with_poses(poses[back]), at_rest, steps * self.physics.time_step, trajectory)
+        return Rollout(stack, stack.with_poses(poses[back]), at_rest, steps * self.physics.step, trajectory)
 
     def close(self) -> None:
-        """Give PyBullet's memory back; the simulator stays usable."""
-        if self._client is not None:
-            bullet.disconnect(self._client.number)
-            self._client = None
+        """Give the engine's memory back; the simulator stays usable."""
+        if self._engine is not None:
+            self._engine.close()
+            self._engine = None
 
     def __enter__(self) -> Simulator:
         return self
@@ -116,40 +131,19 @@ class Simulator:
         self.close()
 
 
-class _Client:
-    """The PyBullet side of a simulator: metres inside, cells outside."""
+class _Watch:
+    """One stack in an engine: metres there, cells here."""
 
-    def __init__(self, physics: Physics) -> None:
-        self.physics = physics
-        self.number = connect(physics)
-        self.molds: dict[Shape, Mold] = {}
-        self.bodies: list[int] = []
-
-    def put(self, shapes: Sequence[Shape], poses: Floats) -> None:
-        """Clear the ground and spawn blocks."""
-        for body in self.bodies:
-            bullet.removeBody(body, physicsClientId=self.number)
-        # A variable of the whole process in Bullet: another physics may have set it meanwhile.
-        threshold = self.physics.contact_threshold
-        bullet.setPhysicsEngineParameter(contactBreakingThreshold=threshold, physicsClientId=self.number)
-        self.start = poses
+    def __init__(self, engine: Engine, physics: Physics, shapes: Sequence[Shape], poses: Floats) -> None:
+        self.engine, self.physics, self.start = engine, physics, poses
         self.com = np.array([shape.center_of_mass for shape in shapes]).reshape(-1, 3)  # in the block frame [cell]
         rotation = Rotation.from_rotvec(poses[:, 3:])
-        positions = (poses[:, :3] + rotation.apply(self.com)) * self.physics.cell_size
-        self.bodies = [
-            self._mold(shape).spawn(position, quaternion, self.number)
-            for shape, position, quaternion in zip(shapes, positions.tolist(), rotation.as_quat().tolist(), strict=True)
-        ]
-
-    def _mold(self, shape: Shape) -> Mold:
-        if shape not in self.molds:
-            self.molds[shape] = Mold.cast(shape, self.physics, self.number)
-        return self.molds[shape]
+        engine.put(shapes, (poses[:, :3] + rotation.apply(self.com)) * physics.cell_size, rotation.as_quat())
 
     def run(self, until_fall: bool, until_moved: float, record_every: int) -> tuple[Floats, bool, int, list[Floats]]:
         """Let time pass; return the final poses (k, 6), whether all rests, the steps taken and the recorded frames."""
         physics = self.physics
-        window = max(1, round(physics.rest_window / physics.time_step))
+        window = max(1, round(physics.rest_window / physics.step))
         look = max(1, window // 5)
         frames = [self.start] if record_every else []
         start = anchor = self._states()
@@ -158,8 +152,7 @@ class _Client:
         # far enough: turning by an angle changes the quaternion's length by at least a quarter of it.
         arm = np.linalg.norm(self.com, axis=1).max(initial=0)
         stir = min(until_moved, physics.fall_height if until_fall else np.inf) / (1 + 10 * arm)
-        for step in range(1, max(1, round(physics.watch / physics.time_step)) + 1):
-            bullet.stepSimulation(physicsClientId=self.number)
+        for step in self._pass_time(look, record_every):
             if record_every and step % record_every == 0:
                 frames.append(self._poses(self._states()))
             if step % look:
@@ -177,72 +170,19 @@ class _Client:
                 return self._poses(state), True, step, frames
         return self._poses(self._states()), False, step, frames
 
+    def _pass_time(self, look: int, record_every: int) -> Iterator[int]:
+        """Let the watch pass; stop where it is looked at or recorded, and at its end. Yield the number of steps."""
+        step, last = 0, max(1, round(self.physics.watch / self.physics.step))
+        while step < last:
+            stop = min(last, *((step // every + 1) * every for every in (look, record_every) if every))
+            self.engine.step(stop - step)
+            yield (step := stop)
+
     def _states(self) -> Floats:
         """Read centres of mass [cell] and quaternions, (k, 7)."""
-        states = [bullet.getBasePositionAndOrientation(b, physicsClientId=self.number) for b in self.bodies]
-        array = np.array([position + quaternion for position, quaternion in states]).reshape(-1, 7)
-        array[:, :3] /= self.physics.cell_size
-        return array
+        return self.engine.states() / [*[self.physics.cell_size] * 3, 1, 1, 1, 1]
 
     def _poses(self, states: Floats) -> Floats:
         """Convert states (k, 7) to poses (k, 6) of the block frames [cell, rad]."""
         rotation = Rotation.from_quat(states[:, 3:])
         return np.concatenate([states[:, :3] - rotation.apply(self.com), rotation.as_rotvec()], axis=1)
-
-
-def connect(physics: Physics, mode: int = bullet.DIRECT) -> int:
-    """Open a client of PyBullet with gravity, ground and the solver's settings; return its number."""
-    client = bullet.connect(mode)
-    bullet.setGravity(0, 0, -physics.gravity, physicsClientId=client)
-    bullet.setPhysicsEngineParameter(
-        fixedTimeStep=physics.time_step,
-        numSolverIterations=physics.solver_iterations,
-        solverResidualThreshold=physics.solver_residual,
-        contactBreakingThreshold=physics.contact_threshold,
-        deterministicOverlappingPairs=1,
-        physicsClientId=client,
-    )
-    plane = bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=client)
-    ground = bullet.createMultiBody(0, plane, physicsClientId=client)
-    bullet.changeDynamics(ground, -1, lateralFriction=physics.friction**0.5, physicsClientId=client)
-    return client
-
-
-@dataclass(frozen=True)
-class Mold:
-    """What the blocks of one shape have in common in one client: collision shape, mass and surface."""
-
-    collision: int
-    mass: float
-    dynamics: dict[str, Any]
-
-    @staticmethod
-    def cast(shape: Shape, physics: Physics, client: int) -> Mold:
-        """Prepare a shape; its body frame is at the centre of mass."""
-        mass = physics.density * shape.volume * physics.cell_size**3
-        dynamics: dict[str, Any] = {"lateralFriction": physics.friction**0.5}  # Bullet multiplies the two surfaces'
-        if shape.is_box:
-            half = [extent / 2 * physics.cell_size for extent in shape.size]
-            collision = bullet.createCollisionShape(bullet.GEOM_BOX, halfExtents=half, physicsClientId=client)
-        else:
-            corners = ((shape.vertices - shape.center_of_mass) * physics.cell_size).tolist()
-            collision = bullet.createCollisionShape(bullet.GEOM_MESH, vertices=corners, physicsClientId=client)
-            dynamics["collisionMargin"] = 0.0  # a mesh would float by its margin
-            dynamics["localInertiaDiagonal"] = (mass * physics.cell_size**2 * _unit_inertia(shape)).tolist()
-        return Mold(collision, mass, dynamics)
-
-    def spawn(self, position: list[float], quaternion: list[float], client: int) -> int:
-        """Add a block with its centre of mass at `position` [m]; return the number of its body."""
-        body = bullet.createMultiBody(self.mass, self.collision, -1, position, quaternion, physicsClientId=client)
-        bullet.changeDynamics(body, -1, **self.dynamics, physicsClientId=client)
-        return int(body)
-
-
-def _unit_inertia(shape: Shape) -> Floats:
-    """Compute the diagonal inertia (3,) of a prism of mass 1 about its centre of mass [cell^2], without products."""
-    a = np.asarray(shape.outline) - shape.center_of_mass[[0, 2]]
-    b = np.roll(a, -1, axis=0)
-    cross = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
-    second = ((a**2 + a * b + b**2) * cross[:, None]).sum(axis=0) / (6 * cross.sum())  # means of x^2 and z^2
-    xx, zz, yy = second[0], second[1], shape.depth**2 / 12
-    return np.array([yy + zz, xx + zz, xx + yy])

@@ -12,11 +12,12 @@ from stackgen.data.generation.designs import draw_design, realize
 from stackgen.errors import StackgenError
 from stackgen.protocols import StabilityChecker
 from stackgen.sim.checkers import AcceptLimits, SimulatorChecker, accept, fell
-from stackgen.sim.physics import Physics, engine_version
+from stackgen.sim.physics import Engine, Physics, default_engine, engine_version
 from stackgen.sim.simulator import Rollout
 from stackgen.sim.statics.checker import StaticsChecker
 from stackgen.stack import Stack
 from stackgen.world import PAPER_WORLD, Catalogue, Shape
+from tests.sim.engines import ENGINES
 
 LIMITS, PHYSICS = AcceptLimits(), Physics()
 
@@ -66,27 +67,30 @@ def test_a_stack_that_leaned_before_is_measured_from_there() -> None:
     assert not accept(Rollout(start, upright, True, 1.0), LIMITS)
 
 
-def test_the_verdict_says_which_block_fell_and_how_far() -> None:
-    checker = SimulatorChecker()
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_verdict_says_which_block_fell_and_how_far(engine: Engine) -> None:
+    checker = SimulatorChecker(Physics(engine=engine))
     poses = np.zeros((3, 6))
     poses[:, 2], poses[2, 0] = [0.5, 1.5, 2.5], 3  # the third has nothing under it
     verdict = checker.check(Stack(np.zeros(3, int), poses))
     assert not verdict.stable and verdict.fell.tolist() == [False, False, True]
     assert verdict.drop == pytest.approx([0, 0, 2], abs=0.02)
     assert verdict.settled.poses[:, 2] == pytest.approx([0.5, 1.5, 0.5], abs=0.02)
-    assert verdict.at_rest and checker.physics == Physics()
+    assert verdict.at_rest and checker.physics == Physics(engine=engine)
     good = checker.check(Stack(np.zeros(2, int), poses[:2]))
     assert good.stable and not good.fell.any()
 
 
-def test_the_early_end_gives_the_same_verdicts() -> None:
+@pytest.mark.parametrize("engine", ENGINES)
+def test_the_early_end_gives_the_same_verdicts(engine: Engine) -> None:
+    physics = Physics(engine=engine)
     rng = np.random.default_rng(1)
     stacks = []
     for _ in range(16):
         stack = realize(draw_design(rng, PAPER_WORLD), rng, PAPER_WORLD)
         keep = np.sort(rng.permutation(len(stack))[: len(stack) - 2])
         stacks.append(Stack(stack.shapes[keep], stack.poses[keep]))
-    whole, early = SimulatorChecker(), SimulatorChecker(until_fall=True)
+    whole, early = SimulatorChecker(physics), SimulatorChecker(physics, until_fall=True)
     verdicts, soon = whole.check_all(stacks), early.check_all(stacks)
     assert [v.stable for v in verdicts] == [v.stable for v in soon]
     assert 0 < sum(v.stable for v in verdicts) < len(stacks)
@@ -95,9 +99,12 @@ def test_the_early_end_gives_the_same_verdicts() -> None:
         assert (whole.check(stack).settled.poses == verdict.settled.poses).all()
 
 
+@pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("make", [SimulatorChecker, StaticsChecker])
-def test_every_checker_says_of_many_stacks_what_it_says_of_each(make: Callable[[Physics], StabilityChecker]) -> None:
-    physics = Physics(friction=0.4)
+def test_every_checker_says_of_many_stacks_what_it_says_of_each(
+    make: Callable[[Physics], StabilityChecker], engine: Engine
+) -> None:
+    physics = Physics(engine=engine, friction=0.4)
     checker = make(physics)
     assert checker.physics == physics
     stands = Stack(np.array([0, 0]), np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]]))
@@ -109,23 +116,44 @@ def test_every_checker_says_of_many_stacks_what_it_says_of_each(make: Callable[[
         assert alone.fell.tolist() == verdict.fell.tolist() and (alone.drop == verdict.drop).all()
 
 
-def test_one_simulator_takes_stacks_of_several_catalogues() -> None:
+@pytest.mark.parametrize("engine", ENGINES)
+def test_one_simulator_takes_stacks_of_several_catalogues(engine: Engine) -> None:
+    physics = Physics(engine=engine)
     tower = np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]])
     slabs = Catalogue((Shape.box("slab", 2, 0.5), Shape.box("cube", 1)))
     stacks = [
         Stack(np.array([0, 0]), tower),
         Stack(np.array([0, 1]), np.array([[0, 0, 0.25, 0, 0, 0], [0.4, 0, 1.0, 0, 0, 0]]), slabs),
     ]
-    together = SimulatorChecker().check_all(stacks + stacks)
+    together = SimulatorChecker(physics).check_all(stacks + stacks)
     for stack, first, again in zip(stacks, together[:2], together[2:], strict=True):
-        alone = SimulatorChecker().check(stack)
+        alone = SimulatorChecker(physics).check(stack)
         assert (alone.settled.poses == first.settled.poses).all() and (first.settled.poses == again.settled.poses).all()
 
 
-def test_the_physics_travel_with_the_engine_s_name() -> None:
-    plain = Physics(friction=0.7).to_json()
-    assert plain.pop("engine") == engine_version() and engine_version().startswith("pybullet ")
-    assert Physics(**plain) == Physics(friction=0.7)
+@pytest.mark.parametrize(("engine", "package"), [("bullet", "pybullet"), ("mujoco", "mujoco")])
+def test_the_physics_travel_with_the_engine_s_name(engine: Engine, package: str) -> None:
+    plain = Physics(engine=engine, friction=0.7).to_json()
+    assert plain["engine"] == engine_version(engine) and plain["engine"].startswith(f"{package} ")
+    assert Physics(**Physics.settings_of(plain)) == Physics(engine=engine, friction=0.7)
+    assert ("solver_iterations" in plain, "solref" in plain) == (engine == "bullet", engine == "mujoco")
+
+
+def test_what_was_made_before_engines_were_named_is_bullet_s() -> None:
+    assert Physics.settings_of({"friction": 0.3}) == {"engine": "bullet", "friction": 0.3}
+
+
+def test_numbers_of_bullet_are_refused_where_mujoco_simulates() -> None:
+    with pytest.raises(StackgenError, match="time_step and contact_threshold belong to Bullet: leave them out"):
+        Physics(engine="mujoco", time_step=0.001, contact_threshold=0.003)
+    with pytest.raises(StackgenError, match="engine must be bullet or mujoco, got 'ode'"):
+        Physics(engine="ode")  # type: ignore[arg-type]
+
+
+def test_the_engine_is_bullet_where_it_is_installed_and_else_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
+    for installed, engine in (({"pybullet", "mujoco"}, "bullet"), ({"mujoco"}, "mujoco"), (set(), "bullet")):
+        monkeypatch.setattr("stackgen.sim.physics.find_spec", lambda name, there=installed: name in there or None)
+        assert default_engine.__wrapped__() == engine
 
 
 @pytest.mark.parametrize(

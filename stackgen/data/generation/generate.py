@@ -119,7 +119,7 @@ class GenerateSettings:
             StackgenError: If its manifest does not hold them, or holds those of another generator.
         """
         plain = {**_BEFORE, **{key: value for key, value in manifest.settings.items() if key != "revision"}}
-        physics = {key: value for key, value in manifest.physics.items() if key != "engine"}
+        physics = Physics.settings_of(manifest.physics)
         world = {"name": manifest.name, "seed": manifest.seed, **vars(manifest.world)}
         try:
             return _revived(GenerateSettings, {**plain, **world, "physics": physics})

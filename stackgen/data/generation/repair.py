@@ -18,7 +18,7 @@ from stackgen.data.manifest import Manifest, ShardEntry, shard_entry, shard_numb
 from stackgen.data.shards import encode_shard, is_whole, iterate_shard
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
-from stackgen.sim.physics import engine_version
+from stackgen.sim.physics import Physics, engine_version
 
 
 @dataclass(frozen=True)
@@ -106,11 +106,16 @@ _SAME = "other versions of numpy or another kind of machine"
 def _difference(manifest: Manifest) -> str:
     """Say how this generator differs from the one that made a dataset."""
     engine, revision = manifest.physics.get("engine"), manifest.settings.get("revision", 1)
-    if engine != engine_version():
-        return f"it was made with {engine}, here is {engine_version()}"
+    if engine != (here := _engine(manifest)):
+        return f"it was made with {engine}, here is {here}"
     if revision != REVISION:
         return f"it was made by revision {revision} of the generator, here is {REVISION}"
     return _SAME
+
+
+def _engine(manifest: Manifest) -> str:
+    """Give name and version of the engine of a dataset as it is installed here."""
+    return engine_version(Physics.settings_of(manifest.physics)["engine"])
 
 
 def _made(
@@ -141,7 +146,7 @@ def _record(folder: Path, manifest: Manifest, others: list[MadeShard]) -> None:
     new: dict[str, dict[str, Any]] = {
         shard.name: {
             **shard_entry(shard.name, shard.content, shard.samples),
-            "made_with": f"{engine_version()}, generator revision {REVISION}",
+            "made_with": f"{_engine(manifest)}, generator revision {REVISION}",
         }
         for shard in others
     }

@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from stackgen.robot.planning.connection import Connected
 from stackgen.robot.planning.urdf import FINGER_JOINTS, FINGERS, chain_links, self_collision_pairs, unusable, with_jaws
 from stackgen.robot.workcell import Workcell
+from stackgen.sim.bullet_engine import Mold, bullet
 from stackgen.sim.physics import Physics
-from stackgen.sim.simulator import Mold, bullet
 from stackgen.stack import Stack
 from stackgen.world import Shape
 

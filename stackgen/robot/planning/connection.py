@@ -6,7 +6,7 @@ from functools import partial
 from types import TracebackType
 from typing import Any, Self
 
-from stackgen.sim.simulator import bullet
+from stackgen.sim.bullet_engine import bullet
 
 
 class Bullet:

@@ -20,8 +20,8 @@ from stackgen.robot.planning.connection import Connected
 from stackgen.robot.planning.motion import Motion
 from stackgen.robot.planning.urdf import FINGERS, PALM, chain_links
 from stackgen.robot.workcell import Grasp, Workcell
+from stackgen.sim.bullet_engine import Mold, bullet, connect
 from stackgen.sim.physics import Physics
-from stackgen.sim.simulator import Mold, bullet, connect
 from stackgen.stack import Stack
 from stackgen.viz.gltf import prism_mesh
 from stackgen.viz.render import shape_colour

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stackgen.errors import StackgenError, require
 from stackgen.io.files import require_folder, write_atomically
 from stackgen.robot.simulated.arm import SimulatedArm
-from stackgen.sim.simulator import bullet
+from stackgen.sim.bullet_engine import bullet
 from stackgen.viz.render import save_image
 
 Picture = NDArray[np.uint8]

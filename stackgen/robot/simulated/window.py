@@ -10,7 +10,7 @@ from stackgen.errors import StackgenError
 from stackgen.robot.planning.clearance import load_arm
 from stackgen.robot.planning.connection import Connected
 from stackgen.robot.simulated.arm import SimulatedArm, block_visual
-from stackgen.sim.simulator import bullet, connect
+from stackgen.sim.bullet_engine import bullet, connect
 
 RATE = 25.0
 """Pictures in a simulated second."""

@@ -31,8 +31,8 @@ from stackgen.robot.planning.plan import plan_build
 from stackgen.robot.planning.staging import TIP_UP
 from stackgen.robot.planning.urdf import arm_file, chain_links, chain_urdf, self_collision_pairs
 from stackgen.robot.workcell import ArmDescription, Base, Staging, Workcell, pose
+from stackgen.sim.bullet_engine import bullet
 from stackgen.sim.physics import Physics
-from stackgen.sim.simulator import bullet
 from stackgen.stack import Stack
 from tests.robot.real import standin
 

@@ -10,8 +10,8 @@ from PIL import Image
 
 from stackgen.errors import StackgenError
 from stackgen.robot.simulated.film import SUFFIXES, _Writer, check_film, outlined, picture
+from stackgen.sim.bullet_engine import Mold, bullet, connect
 from stackgen.sim.physics import Physics
-from stackgen.sim.simulator import Mold, bullet, connect
 from stackgen.world import PAPER_CATALOGUE
 
 

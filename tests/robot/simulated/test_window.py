@@ -10,8 +10,8 @@ from stackgen.robot.planning.motion import joint_motion
 from stackgen.robot.simulated.arm import Floats, SimulatedArm
 from stackgen.robot.simulated.window import Window
 from stackgen.robot.workcell import Workcell
+from stackgen.sim.bullet_engine import bullet
 from stackgen.sim.physics import Physics
-from stackgen.sim.simulator import bullet
 from stackgen.stack import Stack
 
 STACK = Stack(np.array([0, 3]), np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]]))
