@@ -21,6 +21,7 @@ from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.cli import ArgsType, LightningArgumentParser, LightningCLI, SaveConfigCallback
 
+from stackgen.commands.found_config import described, taken_from
 from stackgen.commands.old_names import renew
 from stackgen.commands.parsing import CONFIG_FLAGS, HelpFormatter, epilog, option_values, own_sections, parse
 from stackgen.data.datamodule import StackDataModule
@@ -32,6 +33,7 @@ from stackgen.protocols import StabilityChecker
 from stackgen.sim.other_physics import warn_of_other_physics
 from stackgen.sim.physics import Physics
 from stackgen.training.callbacks import SampleQuality, StepMetrics, Throughput
+from stackgen.training.divergence import StopIfDiverged
 from stackgen.training.loggers import CheckpointArtifact, Dashboard, log_configuration, loggers
 from stackgen.training.runs import RUNS, config_of, describe_run, is_first_process, new_shared_run
 from stackgen.training.sweeps.telling import TellSweep, in_a_sweep
@@ -47,9 +49,11 @@ DESCRIPTIONS = {
     "validate": "Validate a model on the validation split; its metrics go to a new folder in runs.",
 }
 CHECKPOINTS = {
-    "fit": "Checkpoint to resume from: a file, or `last` for the newest of the runs of this name. Without --config, the"
-    " configuration beside it is used.",
-    "validate": "Checkpoint to validate, a file. Without --config, the configuration beside it is used.",
+    "fit": "Checkpoint to resume from: a file, the folder of a run, or `last` for the newest of the runs of this name."
+    " Without --config, the configuration beside it is used, as far as it names nothing but stackgen's own classes and"
+    " local data.",
+    "validate": "Checkpoint to validate: a file, or the folder of a run. Without --config, the configuration beside it is"
+    " used, as far as it names nothing but stackgen's own classes and local data.",
 }
 
 
@@ -160,6 +164,8 @@ class StackgenCLI(LightningCLI):
         if config.ckpt_path == "last":
             config.ckpt_path = str(last_checkpoint(Path(config.trainer.default_root_dir) / config.name))
         elif config.ckpt_path is not None:
+            config.ckpt_path = str(_checkpoint_of(config.ckpt_path))
+        if config.ckpt_path is not None:
             _check_checkpoint(Path(config.ckpt_path))
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
@@ -219,13 +225,22 @@ def _with_saved_config(verb: str, arguments: list[str]) -> list[str]:
     """Put the configuration that lies beside a run's checkpoint in front, where no other was given."""
     if option_values(arguments, (*CONFIG_FLAGS, "--model")):
         return arguments
-    checkpoints = [Path(value) for _, value in option_values(arguments, ("--ckpt_path",))]
+    checkpoints = [_checkpoint_of(value) for _, value in option_values(arguments, ("--ckpt_path",))]
     found = [path for path in map(config_of, checkpoints) if path]
     if not found:
         return arguments
+    typed = {argument.partition("=")[0].removeprefix("--") for argument in arguments if argument.startswith("--")}
+    sections = ("seed_everything", "name", "dashboard", "model", "data", "trainer")
     saved = parse_yaml(renew(read_text(found[-1])), found[-1])
-    asked = [key for key in saved if key != "ckpt_path"] if verb == "fit" else ["name", "model", "data"]
-    return ["--config", to_yaml({key: saved[key] for key in asked}), *arguments]
+    taken = taken_from(saved, found[-1], typed, sections if verb == "fit" else ("name", "model", "data"))
+    if is_first_process():
+        print(described(taken, found[-1]), file=sys.stderr)
+    return ["--config", to_yaml(taken), *arguments]
+
+
+def _checkpoint_of(value: str) -> Path:
+    """Find the checkpoint that `--ckpt_path` means: a file, or the last one of a run's folder."""
+    return last_checkpoint(Path(value)) if Path(value).is_dir() else Path(value)
 
 
 def _check_checkpoint(path: Path) -> None:
@@ -248,7 +263,7 @@ def _complete(callbacks: list[Callback], checkpoints: Path | None) -> list[Callb
         checkpoints: Folder to keep states in; None keeps none.
     """
     found = list(callbacks)
-    for kind in (StepMetrics, Throughput, CheckpointArtifact):
+    for kind in (StepMetrics, Throughput, CheckpointArtifact, StopIfDiverged):
         if not any(isinstance(callback, kind) for callback in found):
             found.append(kind())
     if in_a_sweep():

@@ -23,14 +23,23 @@ _RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "GROUP_RANK", "SLURM_PROCID")
 """What launchers number processes or machines by; all are 0, where they are set, for the first process alone."""
 
 
+def check_run_name(name: str) -> None:
+    """Refuse a name of a run that is no plain name of a folder.
+
+    Raises:
+        StackgenError: The line says what names are made of.
+    """
+    if not re.fullmatch(r"\w[\w.+-]*", name):
+        raise StackgenError(f"run name {name!r}: use letters, digits, '_', '-', '+' and '.' only")
+
+
 def new_run(name: str, root: Path = RUNS, kind: str = "version") -> Path:
     """Make and return the next folder of a run; never one that exists, even if two start at once.
 
     Raises:
         StackgenError: If the name is no plain name of a folder.
     """
-    if not re.fullmatch(r"\w[\w.+-]*", name):
-        raise StackgenError(f"run name {name!r}: use letters, digits, '_', '-', '+' and '.' only")
+    check_run_name(name)
     number = 0
     while True:
         folder = root / name / f"{kind}_{number}"

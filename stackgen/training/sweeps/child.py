@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -18,9 +20,11 @@ from stackgen.training.sweeps.telling import METRICS_FILE, values_told
 
 PATIENCE = 10.0
 """A child that is told to end is killed after this long [s]."""
+PARAMETERS = "parameters.json"
 RUN = "run"
 """A trial of `stackgen fit` leaves its files in TRIAL/run/version_0."""
 
+_VARIABLE = re.compile(r"\$\{envvar:(\w+)\}")
 _PR_SET_PDEATHSIG = 1
 _libc = ctypes.CDLL(None) if sys.platform == "linux" else None
 
@@ -36,25 +40,45 @@ def command_of(sweep: Sweep, values: Mapping[str, Any], folder: Path) -> list[st
     Raises:
         StackgenError: If the command has a macro that is not known here.
     """
+    values = dict(sorted(values.items(), key=lambda item: item[0].count(".")))  # a group before what is set within it
     macros: dict[str, list[str]] = {
         "${env}": [],  # `/usr/bin/env`, which finds a script's interpreter on Unix
         "${interpreter}": [sys.executable],
         "${program}": [sweep.program],
         "${args}": [f"--{name}={_text(value)}" for name, value in values.items()],
         "${args_no_hyphens}": [f"{name}={_text(value)}" for name, value in values.items()],
+        "${args_no_boolean_flags}": [
+            f"--{name}" if value is True else f"--{name}={_text(value)}"
+            for name, value in values.items()
+            if value is not False
+        ],
+        "${args_json}": [json.dumps(values)],
+        "${args_json_file}": [str(folder / PARAMETERS)],
     }
     words: list[str] = []
-    for word in sweep.command or DEFAULT_COMMAND:
+    for word in map(str, sweep.command or DEFAULT_COMMAND):
+        variable = _VARIABLE.fullmatch(word)
+        if variable and variable[1] in os.environ:
+            macros[word] = [os.environ[variable[1]]]
         if "${" in word and word not in macros:
-            raise StackgenError(f"command: {word} is not one of {', '.join(macros)}")
+            known = f"{', '.join(macros)} and ${{envvar:NAME}} of a variable that is set"
+            raise StackgenError(f"command: {word} is not one of {known}")
         words += macros.get(word, [word])
+    if not words:
+        raise StackgenError("command: there is no program in it")
     if words[0] != "stackgen":
         return words
     command = [sys.executable, "-m", *words]
-    if words[1:2] == ["fit"]:
-        command += [f"--name={RUN}", f"--trainer.default_root_dir={folder}"]
-        command += ["--trainer.enable_progress_bar=false", "--trainer.enable_model_summary=false"]
-    return command
+    return [*command, *_of_fit(values, folder)] if words[1:2] == ["fit"] else command
+
+
+def _of_fit(values: Mapping[str, Any], folder: Path) -> list[str]:
+    """Give the options of `stackgen fit` that a sweep sets itself."""
+    own = {"name": RUN, "trainer.default_root_dir": folder}
+    own |= {"trainer.enable_progress_bar": "false", "trainer.enable_model_summary": "false"}
+    if taken := sorted(set(own) & set(values)):
+        raise StackgenError(f"parameter {taken[0]}: a sweep sets it itself for every trial of `stackgen fit`")
+    return [f"--{name}={value}" for name, value in own.items()]
 
 
 def _text(value: Any) -> str:
@@ -79,7 +103,7 @@ class Child:
     def __init__(self, sweep: Sweep, values: Mapping[str, Any], folder: Path, threads: int, lock: int) -> None:
         self.log, self._metrics, self._metric = folder / "log.txt", folder / "metrics.jsonl", sweep.metric.name
         self.told: list[float] = []
-        write_json(folder / "parameters.json", dict(values))
+        write_json(folder / PARAMETERS, dict(values))
         self._metrics.unlink(missing_ok=True)  # an interrupted try may have left one
         environment = {"OMP_NUM_THREADS": str(threads), **os.environ, METRICS_FILE: str(self._metrics.absolute())}
         command = command_of(sweep, values, folder)

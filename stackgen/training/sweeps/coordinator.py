@@ -10,23 +10,26 @@ counts as failed and another one takes its place, and of two workers each may st
 from __future__ import annotations
 
 import fcntl
+import json
 import math
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import yaml
 
 from stackgen.errors import StackgenError, require
 from stackgen.io.files import write_atomically
 from stackgen.io.provenance import cores
-from stackgen.training.sweeps.child import Child
+from stackgen.io.text import parse_yaml, read_yaml
+from stackgen.training.runs import check_run_name
+from stackgen.training.sweeps.child import Child, command_of
 from stackgen.training.sweeps.file import Sweep
 from stackgen.training.sweeps.space import constants_of, grid_of, grid_point, space_of
+from stackgen.training.sweeps.telling import DIVERGED
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
@@ -64,6 +67,7 @@ def run_sweep(
     Raises:
         StackgenError: If another coordinator is at work in the folder, or trial after trial fails.
     """
+    check_sweep(sweep)
     space, constants = space_of(sweep.parameters), constants_of(sweep.parameters)
     threads = max(1, cores() // parallel)
     with folder_lock(folder) as lock:
@@ -88,12 +92,24 @@ def run_sweep(
                     if ended is not None:
                         del running[number]
                         tell(line := line_of(ended, sweep))
-                        failures = failures + 1 if ended.state.name == "FAIL" else 0
+                        failures = failures + 1 if "failure" in ended.user_attrs else 0
                         if failures == FAILURES:
                             raise StackgenError(f"{FAILURES} trials in a row failed; {line}; see {child.log}")
         finally:
             for _, child in running.values():
                 child.stop()
+
+
+def check_sweep(sweep: Sweep) -> None:
+    """Refuse a sweep that cannot be run or whose findings could not be read back, before anything is made.
+
+    Raises:
+        StackgenError: The line names what is wrong.
+    """
+    check_run_name(sweep.name)
+    trials_wanted(sweep)
+    every = {**constants_of(sweep.parameters), **dict.fromkeys(space_of(sweep.parameters))}
+    command_of(sweep, every, Path())
 
 
 def next_trial(study: Study, sweep: Sweep, space: Mapping[str, BaseDistribution]) -> Trial | None:
@@ -123,7 +139,10 @@ def follow(study: Study, trial: Trial, child: Child, sweep: Sweep) -> FrozenTria
             return study.tell(trial, state=TrialState.PRUNED)
     if code is None:
         return None
-    if code == 0 and child.told and math.isfinite(child.told[-1]):
+    if child.told and not math.isfinite(child.told[-1]):
+        trial.set_user_attr(DIVERGED, f"{sweep.metric.name} was {child.told[-1]} at report {len(child.told)}")
+        return study.tell(trial, state=TrialState.FAIL)
+    if code == 0 and child.told:
         return study.tell(trial, child.told[-1])
     why = f"exit code {code}: {child.last_words()}" if code else f"it never told {sweep.metric.name}"
     trial.set_user_attr("failure", why)
@@ -132,6 +151,8 @@ def follow(study: Study, trial: Trial, child: Child, sweep: Sweep) -> FrozenTria
 
 def line_of(trial: FrozenTrial, sweep: Sweep) -> str:
     """Say in a line how a trial ended."""
+    if DIVERGED in trial.user_attrs:
+        return f"trial {trial.number}: diverged: {trial.user_attrs[DIVERGED]}"
     if trial.state.name == "FAIL":
         return f"trial {trial.number}: failed: {trial.user_attrs['failure']}"
     if trial.state.name == "PRUNED":
@@ -175,24 +196,45 @@ def open_study(sweep: Sweep, folder: Path, seed: int = 0, parallel: int = 1) -> 
     for stale in folder.glob(f"{JOURNAL}.lock*"):
         stale.unlink(missing_ok=True)
     mend_journal(journal)
-    study = optuna.create_study(
-        storage=optuna.storages.JournalStorage(JournalFileBackend(str(journal))),
-        study_name=sweep.name,
-        direction=sweep.metric.goal,
-        pruner=_pruner(sweep),
-        load_if_exists=True,
-    )
+    try:
+        study = optuna.create_study(
+            storage=optuna.storages.JournalStorage(JournalFileBackend(str(journal))),
+            study_name=sweep.name,
+            direction=sweep.metric.goal,
+            pruner=_pruner(sweep),
+            load_if_exists=True,
+        )
+    except Exception as error:
+        raise StackgenError(f"{journal} is damaged: {error!r:.80}; choose another --out") from error
     study.sampler = _sampler(sweep, seed, len(trials_of(study)), parallel)
     return study
 
 
 def mend_journal(journal: Path) -> None:
-    """Cut off a last line that a killed process left half-written: Optuna would glue its next line to it."""
-    if journal.exists():
-        content = journal.read_bytes()
-        whole = content[: content.rfind(b"\n") + 1]
-        if len(whole) < len(content):
-            write_atomically(journal, whole)
+    """Drop what a killed process or a machine without power left of lines: blanks, NULs and half a line at the end.
+
+    Optuna would glue its next line to it, or read no further.
+
+    Raises:
+        StackgenError: If another line is damaged: what it said is lost.
+    """
+    if not journal.exists():
+        return
+    content = journal.read_bytes()
+    lines = [line.strip(b"\0 \t\r") for line in content[: content.rfind(b"\n") + 1].split(b"\n")]
+    for number, line in enumerate(lines, 1):
+        if line and not _is_entry(line):
+            raise StackgenError(f"{journal} is damaged at line {number}; choose another --out")
+    whole = b"".join(line + b"\n" for line in lines if line)
+    if whole != content:
+        write_atomically(journal, whole)
+
+
+def _is_entry(line: bytes) -> bool:
+    try:
+        return "op_code" in json.loads(line)
+    except (ValueError, TypeError, RecursionError):
+        return False
 
 
 def _sampler(sweep: Sweep, seed: int, known: int, parallel: int) -> BaseSampler:
@@ -244,8 +286,10 @@ def remember(sweep: Sweep, folder: Path) -> None:
     Raises:
         StackgenError: If the folder's sweep differs in more than the number of trials.
     """
-    path, content = folder / SWEEP_FILE, sweep.to_json()
-    before: dict[str, Any] = yaml.safe_load(path.read_text()) if path.exists() else content
+    path, content = folder / SWEEP_FILE, parse_yaml(sweep.to_yaml(), sweep.name)
+    before = read_yaml(path) if path.exists() else content
+    if not isinstance(before, dict):
+        raise StackgenError(f"{path} is empty or damaged; put the sweep file there, or choose another --out")
     changed = [key for key in {**before, **content} if before.get(key) != content.get(key)]
     changed = [key for key in changed if key not in _MAY_CHANGE]
     if changed:

@@ -8,9 +8,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-import yaml
-
 from stackgen.errors import StackgenError
+from stackgen.io.text import to_yaml
 
 DEFAULT_COMMAND = ("${env}", "${interpreter}", "${program}", "${args}")
 """What W&B runs where a file has no `command`."""
@@ -69,8 +68,7 @@ class Sweep:
         parameters: Parameters to try: for each name `value`, `values`, or `min` and `max` with a `distribution`.
         metric: Metric that is optimised.
         method: Way to propose values: `bayes` learns from the trials so far (here TPE), `random` and `grid` do not.
-        command: Words of a trial's command line; `${program}`, `${interpreter}`, `${env}`, `${args}` and
-            `${args_no_hyphens}` are filled in.
+        command: Words of a trial's command line; W&B's macros, such as `${program}` and `${args}`, are filled in.
         early_terminate: Rule by which a trial is stopped early; without it none is.
         run_cap: Number of trials in all; 30 by default, for a grid all its points.
         name: Name of the sweep; its files go to runs/sweeps/NAME.
@@ -83,7 +81,7 @@ class Sweep:
     parameters: dict[str, dict[str, Any]]
     metric: Metric
     method: Literal["bayes", "random", "grid"] = "bayes"
-    command: list[str] | None = None
+    command: list[str | int | float | bool] | None = None
     early_terminate: EarlyTerminate | None = None
     run_cap: int | None = None
     name: str = "sweep"
@@ -106,4 +104,4 @@ class Sweep:
 
     def to_yaml(self) -> str:
         """Write the file for `wandb sweep`."""
-        return yaml.safe_dump(self.to_json(), sort_keys=False)
+        return to_yaml(self.to_json())

@@ -5,20 +5,21 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import yaml
 from jsonargparse import Namespace
 from rich.table import Table
 
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
+from stackgen.io.text import read_yaml, to_yaml
 from stackgen.training.runs import RUNS
 from stackgen.training.sweeps.child import RUN
 from stackgen.training.sweeps.file import Sweep
 from stackgen.training.sweeps.space import constants_of, space_of
+from stackgen.training.sweeps.telling import DIVERGED
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,9 +36,16 @@ _LETTERS = 24
 
 
 def value_of(trial: FrozenTrial) -> float:
-    """Give a trial's value of the metric: the last that was told; NaN if none was."""
+    """Give a trial's value of the metric: the last that was told; NaN if none was, or if the trial diverged."""
+    if state_of(trial) == DIVERGED:
+        return math.nan
     told = trial.intermediate_values
     return trial.value if trial.value is not None else told[max(told)] if told else math.nan
+
+
+def state_of(trial: FrozenTrial) -> str:
+    """Say how a trial ended, in a word."""
+    return DIVERGED if DIVERGED in trial.user_attrs else trial.state.name.lower()
 
 
 def ranking(study: Study) -> list[FrozenTrial]:
@@ -82,7 +90,7 @@ def leaderboard(trials: Sequence[FrozenTrial], sweep: Sweep) -> str:
         seconds = trial.duration.total_seconds() if trial.duration else math.nan
         metrics = [f"{value_of(trial):.6g}", len(trial.intermediate_values), f"{seconds:.1f}"]
         values = [trial.params.get(name) for name in names]
-        table.writerow([rank, trial.number, trial.state.name.lower(), *metrics, *values])
+        table.writerow([rank, trial.number, state_of(trial), *metrics, *values])
     return text.getvalue()
 
 
@@ -94,7 +102,7 @@ def leaderboard_table(trials: Sequence[FrozenTrial], sweep: Sweep, most: int = 1
     table = Table("trial", "state", sweep.metric.name, *heads, box=None, pad_edge=False)
     for trial in trials[:most]:
         values = [_shown(trial.params.get(name)) for name in names]
-        table.add_row(str(trial.number), trial.state.name.lower(), f"{value_of(trial):.4g}", *values)
+        table.add_row(str(trial.number), state_of(trial), f"{value_of(trial):.4g}", *values)
     return table
 
 
@@ -111,15 +119,26 @@ def best_configuration(best: FrozenTrial, sweep: Sweep, folder: Path, trials: in
         key=lambda path: path.stat().st_mtime,
     )
     if not runs:
-        values = Namespace()  # dotted names become groups
-        for name, value in {**constants_of(sweep.parameters), **best.params}.items():
-            values[name] = value
-        return title + yaml.safe_dump(values.as_dict(), sort_keys=False)
-    config = yaml.safe_load(runs[-1].read_text())
+        return title + to_yaml(grouped({**constants_of(sweep.parameters), **best.params}))
+    config = read_yaml(runs[-1])
     config["name"] = f"{sweep.name}-best"
     config.pop("ckpt_path", None)
     config["trainer"] |= {"default_root_dir": str(RUNS), "enable_progress_bar": None, "enable_model_summary": None}
-    return title + f"#   stackgen fit --config {folder / BEST}\n" + yaml.safe_dump(config, sort_keys=False)
+    return title + f"#   stackgen fit --config {folder / BEST}\n" + to_yaml(config)
+
+
+def grouped(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Make groups of dotted names; if a name is a value and a group too, all stay as they are.
+
+    >>> grouped({"a.b": 1, "a.c": 2}), grouped({"a.b": 1, "a": 2})
+    ({'a': {'b': 1, 'c': 2}}, {'a.b': 1, 'a': 2})
+    """
+    if any(other.startswith(f"{name}.") for name in values for other in values):
+        return dict(values)
+    groups = Namespace()
+    for name, value in values.items():
+        groups[name] = value
+    return groups.as_dict()
 
 
 def write_importance(study: Study, sweep: Sweep, path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -20,13 +21,48 @@ from tests.training.sweeps.test_coordinator import REAL, ROOT, sweep_of
 
 def test_the_macros_of_wandb_are_filled_in(tmp_path: Path) -> None:
     sweep = replace(sweep_of(tmp_path / "program.py"), command=["${env}", "${interpreter}", "a", "${args_no_hyphens}"])
-    assert command_of(sweep, {"x.y": 1, "z": None}, tmp_path) == [sys.executable, "a", "x.y=1", "z=null"]
+    assert command_of(sweep, {"x.y": 1, "z": None}, tmp_path) == [sys.executable, "a", "z=null", "x.y=1"]
     fit = replace(sweep, command=["stackgen", "fit", "${args}"])
     words = command_of(fit, {"x": True}, tmp_path)
     assert words[:5] == [sys.executable, "-m", "stackgen", "fit", "--x=True"]
     assert f"--trainer.default_root_dir={tmp_path}" in words
     with pytest.raises(StackgenError, match="is not one of"):
-        command_of(replace(sweep, command=["${args_json}"]), {}, tmp_path)
+        command_of(replace(sweep, command=["${arg}"]), {}, tmp_path)
+
+
+def test_every_word_that_wandb_takes_is_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PLACE", "here")
+    values = {"flag": True, "other": False, "rate": 1e-05}
+
+    def words(*command: str | float) -> list[str]:
+        return command_of(replace(sweep_of(tmp_path / "program.py"), command=list(command)), values, tmp_path)
+
+    assert words("python", "main.py", "--epochs", 10, "--rate", 0.5) == [
+        "python",
+        "main.py",
+        "--epochs",
+        "10",
+        "--rate",
+        "0.5",
+    ]
+    assert words("a", "${args_no_boolean_flags}") == ["a", "--flag", "--rate=1e-05"]
+    assert json.loads(words("a", "${args_json}")[1]) == values
+    assert words("a", "${args_json_file}", "${envvar:PLACE}") == ["a", str(tmp_path / "parameters.json"), "here"]
+    with pytest.raises(StackgenError, match="variable that is set"):
+        words("a", "${envvar:NO_SUCH_PLACE}")
+    with pytest.raises(StackgenError, match="no program"):
+        words("${env}")
+
+
+def test_a_group_comes_before_what_is_set_within_it(tmp_path: Path) -> None:
+    values = {"a.b.c": 1, "a.b": "{c: 2}", "x": 3}
+    assert command_of(sweep_of(Path("p")), values, tmp_path)[2:] == ["--x=3", "--a.b={c: 2}", "--a.b.c=1"]
+
+
+def test_a_parameter_that_the_sweep_sets_itself_is_refused(tmp_path: Path) -> None:
+    sweep = replace(sweep_of(Path("p")), command=["stackgen", "fit", "${args}"])
+    with pytest.raises(StackgenError, match="parameter name: a sweep sets it itself"):
+        command_of(sweep, {"name": "x"}, tmp_path)
 
 
 def test_every_parameter_of_the_real_sweep_is_an_option_of_fit(

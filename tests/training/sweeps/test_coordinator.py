@@ -16,6 +16,7 @@ import pytest
 import yaml
 
 from stackgen.errors import StackgenError
+from stackgen.io.text import read_yaml
 from stackgen.training.sweeps.coordinator import folder_lock, mend_journal, open_study, run_sweep
 from stackgen.training.sweeps.file import EarlyTerminate, Metric, Sweep
 from stackgen.training.sweeps.findings import ranking, write_findings
@@ -165,6 +166,87 @@ def test_a_journal_that_was_cut_off_is_mended(program: Path, tmp_path: Path) -> 
     mend_journal(journal)
     assert journal.read_bytes() == whole
     assert states(tmp_path, sweep) == ["complete"] * 2
+
+
+@pytest.mark.parametrize("litter", [b"\n\n", b"\0" * 40, b"\0\n \n\0", b'\n{"op_code": 4, "wor'])
+def test_blanks_and_nuls_of_a_journal_are_mended(litter: bytes, program: Path, tmp_path: Path) -> None:
+    sweep = sweep_of(program, run_cap=2)
+    run_sweep(sweep, tmp_path, tell=lambda line: None)
+    journal = tmp_path / "journal.log"
+    whole = journal.read_bytes()
+    lines = whole.splitlines(keepends=True)
+    journal.write_bytes(b"".join(lines[:3]) + litter.partition(b"{")[0] + b"".join(lines[3:]) + litter)
+    mend_journal(journal)
+    assert journal.read_bytes() == whole
+    assert states(tmp_path, sweep) == ["complete"] * 2
+
+
+@pytest.mark.parametrize("damage", ["half a line", "nonsense", "entry without meaning", "empty sweep", "half a sweep"])
+def test_a_record_that_is_damaged_is_named(damage: str, program: Path, tmp_path: Path) -> None:
+    sweep = sweep_of(program, run_cap=1)
+    run_sweep(sweep, tmp_path, tell=lambda line: None)
+    journal, file = tmp_path / "journal.log", tmp_path / "sweep.yaml"
+    lines = journal.read_bytes().splitlines(keepends=True)
+    if damage == "half a line":
+        journal.write_bytes(b"".join([*lines[:2], lines[2][:20] + b"\n", *lines[3:]]))
+    elif damage == "nonsense":
+        journal.write_bytes(b"[1, 2]\n")
+    elif damage == "entry without meaning":
+        journal.write_bytes(b'{"op_code": 0}\n')
+    else:
+        file.write_bytes(b"" if damage == "empty sweep" else file.read_bytes()[:5])
+    with pytest.raises(StackgenError, match=r"(journal\.log|sweep\.yaml) is (empty or )?damaged") as caught:
+        run_sweep(sweep, tmp_path, tell=lambda line: None)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["lr search 1", "../../x", "", ".", "a/b", "x\ny"])
+def test_a_name_that_no_run_may_have_is_refused_before_anything_is_made(
+    name: str, program: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(StackgenError, match="run name"):
+        run_sweep(sweep_of(program, name=name), tmp_path / "out")
+    assert [path.name for path in tmp_path.iterdir()] == [program.name]
+
+
+DIVERGING = """
+import json, os, sys
+x = float(sys.argv[1].partition("=")[2])
+with open(os.environ["STACKGEN_METRICS"], "a") as file:
+    for step in range(3):
+        lost = {"diverged": True} if x > 3 else {"loss": float("nan") if x > 2 else float("inf")}
+        file.write(json.dumps({"step": step, **({"loss": x + 1 - step / 3} if x < 2 or step < 1 else lost)}) + "\\n")
+sys.exit(2 if x > 3 else 0)
+"""
+
+
+def test_trials_that_diverge_are_called_so_and_the_sweep_goes_on(program: Path, tmp_path: Path) -> None:
+    program.write_text(DIVERGING)
+    sweep = sweep_of(program, method="grid", parameters={"x": {"values": [2.5, 3.5, 4.5, 2, 5.5, 1]}})
+    lines: list[str] = []
+    study = run_sweep(sweep, tmp_path, tell=lines.append)
+    assert [("diverged" in line) for line in lines] == [True] * 5 + [False]
+    write_findings(study, sweep, tmp_path)
+    rows = list(csv.DictReader((tmp_path / "leaderboard.csv").open()))
+    assert [row["state"] for row in rows] == ["complete"] + ["diverged"] * 5
+    assert [row["loss"] for row in rows[1:]] == ["nan"] * 5
+    assert yaml.safe_load((tmp_path / "best.yaml").read_text()) == {"x": 1}
+
+
+def test_every_value_that_was_tried_is_reported(program: Path, tmp_path: Path) -> None:
+    """Also where one name is the beginning of another, and where a text looks like a number."""
+    parameters = {
+        "x": {"values": [3, 4]},
+        "x.rate": {"value": 0.1},
+        "tag": {"values": ["77950e8", "yes"]},
+        "t.u": {"value": "0777"},
+    }
+    sweep = sweep_of(program, method="grid", parameters=parameters, run_cap=1)
+    write_findings(run_sweep(sweep, tmp_path, tell=lambda line: None), sweep, tmp_path)
+    tried = json.loads((tmp_path / "trials/0000/parameters.json").read_text())
+    assert tried == {"x.rate": 0.1, "t.u": "0777", "x": 3, "tag": "77950e8"}
+    assert read_yaml(tmp_path / "best.yaml") == tried
 
 
 def test_without_optuna_the_help_and_the_export_work_and_a_sweep_names_the_extra(
