@@ -33,7 +33,8 @@ def test_parameters_of_wandb_are_distributions_of_optuna() -> None:
         "f": FloatDistribution(0, 1, step=0.25),
         "g.h": IntDistribution(1, 64, log=True),
     }
-    assert grid_of({"f": found["f"], "b": found["b"]}) == {"f": [0, 0.25, 0.5, 0.75, 1], "b": [1, 2, 3, 4, 5]}
+    grid = grid_of({"f": found["f"], "b": found["b"]})
+    assert {name: list(values) for name, values in grid.items()} == {"f": [0, 0.25, 0.5, 0.75, 1], "b": [1, 2, 3, 4, 5]}
 
 
 @pytest.mark.parametrize(
