@@ -22,11 +22,15 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import iou, silhouette
 from stackgen.stack import Stack
 from stackgen.vision.cameras import Rig, simulated_frame
+from stackgen.vision.cells import in_cells
 from stackgen.vision.depth import find_structure
-from stackgen.vision.drawings import read_silhouette
+from stackgen.vision.masks import fitted
 from stackgen.world import PAPER_GRID, Mask
 
 KINDS = ("as seen", "in cells")
+
+ALIKE = 0.85
+"""Least IoU with the stretched silhouette for a structure to count as made of whole cells."""
 
 
 @dataclass(frozen=True)
@@ -79,13 +83,15 @@ def case(stack: Stack, rng: np.random.Generator, model: Model) -> Case:
     distance, elevation, azimuth = rng.uniform([0.55, 0, -15], [0.9, 25, 15])
     rig = Rig(float(distance), float(elevation), float(azimuth))
     seed = int(rng.integers(2**31))
-    found = find_structure(simulated_frame(stack, rig, seed=seed), PAPER_GRID)
+    found = find_structure(simulated_frame(stack, rig, seed=seed))
+    as_seen = fitted(found.front, PAPER_GRID)
+    in_whole, cells, _ = in_cells(as_seen, ALIKE, PAPER_GRID)
     own = own_silhouette(stack)
-    silhouettes = (found.as_seen, found.silhouette)
+    silhouettes = (as_seen, in_whole)
     best = [model.sample_verified(mask, 1, seed).entries[0] for mask in silhouettes]
     return Case(
         tuple(iou(mask, own) for mask in silhouettes),
-        found.cells is not None,
+        cells is not None,
         found.left_out,
         tuple(entry.verdict is not None and entry.verdict.stable for entry in best),
         tuple(iou(own_silhouette(entry.stack), own) for entry in best),
@@ -94,7 +100,7 @@ def case(stack: Stack, rng: np.random.Generator, model: Model) -> Case:
 
 def own_silhouette(stack: Stack) -> Mask:
     """The stack's silhouette (H, W), framed as captured ones are."""
-    return read_silhouette(silhouette(stack, PAPER_GRID), PAPER_GRID, exact=False)
+    return fitted(silhouette(stack, PAPER_GRID), PAPER_GRID)
 
 
 def summary(cases: Sequence[Case], kind: int) -> dict[str, Any]:

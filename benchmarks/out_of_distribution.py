@@ -170,7 +170,7 @@ def scenes_of_kind(kind: str, scenes: Sequence[Scene], checker: StabilityChecker
     from dataclasses import replace
 
     from stackgen.evaluation.protocol import Scene
-    from stackgen.vision.drawings import read_silhouette
+    from stackgen.vision.reader import read_silhouette
 
     if kind == EXAMPLES:
         files = sorted(DRAWINGS.iterdir())

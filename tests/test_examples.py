@@ -12,7 +12,7 @@ from stackgen.geometry import silhouette_iou, tilt
 from stackgen.io.stacks_file import read_stacks
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.stack import Stack
-from stackgen.vision.drawings import read_silhouette
+from stackgen.vision.reader import read_silhouette
 from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

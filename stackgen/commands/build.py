@@ -25,6 +25,9 @@ from stackgen.robot.planning.build_order import Strategy
 from stackgen.robot.planning.kinematics import SolverName
 from stackgen.robot.workcell import Grasp, Workcell
 from stackgen.stack import format_block_list
+from stackgen.vision.reader import PictureOptions, read_picture
+from stackgen.viz.render import save_image
+from stackgen.world import PAPER_GRID
 
 if TYPE_CHECKING:
     from stackgen.robot.build import PlannedBuild
@@ -37,8 +40,8 @@ class Wanted:
 
     Args:
         stack: Number of the stack in the file, from 1.
-        from_image: Picture, photo of a sketch, or depth frame (as for `stackgen capture`) to build instead of a file:
-            the best of the verified stacks for it.
+        from_image: Drawing, photo of a sketch, or depth frame (as for `stackgen capture`) to build instead of a file:
+            the best of the verified stacks for it. The folder of --out then holds silhouette.png and overlay.png, too.
         inventory: With --from_image, blocks that are available, such as cube=4,rectangle=3.
         weights: With --from_image, weights of the sampler: a name, .safetensors, .ckpt or run folder.
         budget: With --from_image, limit of the search for stacks: a time, such as 5s, or a number of draws.
@@ -85,11 +88,14 @@ class Simulation:
         return self != Simulation()
 
 
-def main(wanted: Wanted, simulation: Simulation, real: RealArm, file: Path | None = None) -> int:
+def main(
+    wanted: Wanted, picture: PictureOptions, simulation: Simulation, real: RealArm, file: Path | None = None
+) -> int:
     """Build a structure with a UR5 and parallel jaws, simulated or real; exit code 1 if it does not stand in the end.
 
     Args:
         wanted: What is built.
+        picture: What the user says of the picture of --from_image.
         simulation: What the simulated arm does.
         real: Who builds, and what a real arm needs.
         file: File of stacks (stacks.json).
@@ -99,7 +105,12 @@ def main(wanted: Wanted, simulation: Simulation, real: RealArm, file: Path | Non
     from stackgen.sim.physics import Physics
 
     placed = _check_options(wanted, simulation, real)
-    content = _from_file(file, wanted) if wanted.from_image is None else _from_image(wanted.from_image, file, wanted)
+    if wanted.from_image is None:
+        if picture != PictureOptions():
+            raise StackgenError("--as, --which, --depth_scale, --focal and --cell_size go with --from_image")
+        content = _from_file(file, wanted)
+    else:
+        content = _from_image(wanted.from_image, file, wanted, picture)
     physics = replace(Physics.recorded(content.physics), cell_size=content.cell_size)
     with progress_bar("plan", len(content.stacks[0])) as (advance, say):
         plan = partial(
@@ -114,10 +125,7 @@ def main(wanted: Wanted, simulation: Simulation, real: RealArm, file: Path | Non
         planned = first_buildable(content.stacks, plan)
         if not planned.design.order.safe:
             say(f"the greedy order is not safe: {planned.design.order.blocked}")
-    try:
-        wanted.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StackgenError(f"--out {wanted.out}: cannot be made: {error.strerror or error}") from error
+    _make_folder(wanted.out)
     write_sheet(real, planned)
     if real.arm != "simulation":
         return build_for_real(planned, real, wanted.out)
@@ -158,24 +166,38 @@ def _from_file(file: Path | None, wanted: Wanted) -> StacksFile:
     return replace(content, entries=(content.entries[wanted.stack - 1],))
 
 
-def _from_image(image: Path, file: Path | None, wanted: Wanted) -> StacksFile:
-    """Sample stacks for a picture; those that stand, the best first."""
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StackgenError(f"--out {out}: cannot be made: {error.strerror or error}") from error
+
+
+def _from_image(image: Path, file: Path | None, wanted: Wanted, picture: PictureOptions) -> StacksFile:
+    """Read a picture, write what was read, and sample stacks for it: those that stand, the best first."""
     if file is not None:
         raise StackgenError(f"give {file} or --from_image {image}, not both")
+    reading = read_picture(image, PAPER_GRID, **vars(picture))
+    _make_folder(wanted.out)
+    save_image(wanted.out / "overlay.png", reading.overlay)
     from stackgen.api import load
     from stackgen.robot.candidates import NUMBER, stacks_of_picture
 
     with progress_bar("stacks", NUMBER + 1) as (advance, _):
         done = iter(range(1, NUMBER + 2))
         found = stacks_of_picture(
-            image,
+            reading,
+            image.name,
             load(wanted.weights),
             inventory=wanted.inventory,
             budget=wanted.budget,
             seed=wanted.seed,
             on_step=lambda: advance(next(done)),
         )
-    assert found.block_list is not None
+    assert found.block_list is not None and found.target is not None
+    save_image(wanted.out / "silhouette.png", found.target)
+    for line in (f"read as a {reading.describe()}", *reading.notes):
+        Console().print(line, highlight=False, markup=False)
     blocks, best = format_block_list(found.block_list, found.world.catalogue), found.entries[0].front_iou
     Console().print(f"{image.name}: {blocks}; {found.comment}; front IoU {best:.2f}", highlight=False)
     return found
@@ -268,7 +290,7 @@ COMMAND = Command(
     stackgen build examples/stacks/arch.json --arm ur-rtde --host 192.168.0.10 --execute
     """,
     files=Files("file", "FILE", "File of stacks (stacks.json).", optional=True),
-    settings={"wanted": Wanted, "simulation": Simulation, "real": RealArm},
+    settings={"wanted": Wanted, "picture": PictureOptions, "simulation": Simulation, "real": RealArm},
     flags={
         "gui": "Show the build in a window, where there is a display.",
         "execute": "Have the real arm move; without it everything else is done.",

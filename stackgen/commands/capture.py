@@ -1,132 +1,136 @@
-"""stackgen capture: from a depth frame or the photo of a drawing to a silhouette."""
+"""stackgen capture: from a drawing, the photo of a sketch or a depth frame to a silhouette."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from stackgen.commands.parsing import Command
+from stackgen.commands.parsing import Command, Files
 from stackgen.errors import StackgenError
 from stackgen.geometry import iou
 from stackgen.geometry import silhouette as silhouette_of
 from stackgen.io.stacks_file import read_stacks
 from stackgen.stack import format_block_list
 from stackgen.vision.cameras import Rig, realsense_frame, simulated_frame
-from stackgen.vision.cells import Ints
-from stackgen.vision.depth import DepthFrame, Floats, Picture, find_structure, read_frame
-from stackgen.vision.drawings import read_silhouette
-from stackgen.vision.sketches import read_sketch
+from stackgen.vision.cells import Ints, in_cells
+from stackgen.vision.depth import DepthFrame
+from stackgen.vision.images import Picture
+from stackgen.vision.masks import fitted
+from stackgen.vision.reader import PictureOptions, Reading, filling, place, read_picture, read_silhouette
 from stackgen.viz.render import save_image
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Mask
 
-_RED = (214, 39, 40)
-_LEFT_OUT = 0.05
-"""Share of the structure from which on what was left out beside it is worth telling."""
+_ALIKE = {"drawing": 0.85, "photo": 0.75, "depth": 0.85}
+"""Least IoU with the stretched figure for it to count as made of whole cells."""
+
+_ROOM = 0.25
+"""What a structure may be larger than the grid [cell]."""
 
 
 @dataclass(frozen=True)
-class _Result:
-    """The silhouette that was found, and how it is shown.
+class Source:
+    """Where the picture comes from.
 
     Args:
-        silhouette: (H, W).
-        overlay: (h, w, 3) the picture with what was found in it.
-        lines: Lines to print.
-    """
-
-    silhouette: Mask
-    overlay: Picture
-    lines: tuple[str, ...]
-
-
-def main(
-    out: Path,
-    depth: Path | None = None,
-    color: Path | None = None,
-    sketch: Path | None = None,
-    simulate: Path | None = None,
-    realsense: bool = False,
-    freehand: bool = False,
-    network: bool = False,
-    stack: int = 1,
-    focal: float | None = None,
-    elevation: float = 8.0,
-    azimuth: float = 0.0,
-    seed: int = 0,
-    truth: Path | None = None,
-    overlay: Path | None = None,
-) -> None:
-    """Find the silhouette of a structure before a depth camera, or in the photo of a drawing.
-
-    Args:
-        out: PNG file to write the silhouette to; `stackgen sample` takes it.
-        depth: Depth frame: a 16-bit PNG in mm, or a .npy in m.
-        color: Picture of the same pixels as --depth, for the overlay.
-        sketch: Photo of a drawing on paper, filled or in outline.
+        depth: Depth frame: a 16-bit PNG or TIFF, or a .npy (H, W).
+        color: Picture of the same pixels as a depth frame, for the overlay.
+        sketch: Drawing, or photo of a drawing on paper, filled or in outline.
         simulate: File of stacks (stacks.json); a simulated depth camera looks at one of them.
         stack: Number of the stack in the file of --simulate, from 1.
-        focal: Focal length of --depth [pixel]; that of a RealSense D435 by default.
+        realsense: Take a frame from the first RealSense camera.
         elevation: Angle of the simulated camera above the horizontal [deg].
         azimuth: Angle of the simulated camera to the right of the front [deg].
         seed: Seed of the simulated camera's noise.
+    """
+
+    depth: Path | None = None
+    color: Path | None = None
+    sketch: Path | None = None
+    simulate: Path | None = None
+    stack: int = 1
+    realsense: bool = False
+    elevation: float = 8.0
+    azimuth: float = 0.0
+    seed: int = 0
+
+
+def main(
+    source: Source,
+    picture: PictureOptions,
+    out: Path,
+    image: Path | None = None,
+    freehand: bool = False,
+    network: bool = False,
+    truth: Path | None = None,
+    overlay: Path | None = None,
+) -> None:
+    """Find the silhouette of a structure in a drawing, in the photo of one, or before a depth camera.
+
+    Args:
+        source: Where the picture comes from.
+        picture: What the user says of it.
+        out: PNG file to write the silhouette to; `stackgen sample` takes it.
+        image: Picture of any kind.
         truth: Picture of the structure, with which the silhouette is compared.
         overlay: PNG or JPEG file to write the picture with what was found to; by default it lies beside the silhouette.
     """
-    if sum([bool(depth), bool(sketch), bool(simulate), realsense]) != 1:
-        raise StackgenError("give one of --depth FILE, --sketch PHOTO, --simulate STACKS and --realsense")
-    if seed < 0:
-        raise StackgenError(f"--seed must be at least 0, got {seed}")
-    if color and not depth:
-        raise StackgenError("--color belongs to --depth: give both")
+    if sum([bool(image), bool(source.depth), bool(source.sketch), bool(source.simulate), source.realsense]) != 1:
+        raise StackgenError("give one of IMAGE, --depth FILE, --sketch PHOTO, --simulate STACKS and --realsense")
+    if source.seed < 0:
+        raise StackgenError(f"--seed must be at least 0, got {source.seed}")
     expected = None if truth is None else read_silhouette(truth, PAPER_GRID)
-    if sketch:
-        result = _from_sketch(sketch, freehand)
-    elif simulate:
-        frame, own = _simulated(simulate, stack, elevation, azimuth, seed)
-        expected = own if expected is None else expected
-        result = _from_frame(frame, freehand)
-    elif depth:
-        result = _from_frame(read_frame(depth, color, focal), freehand, f"{depth}: ")
-    else:
-        result = _from_frame(realsense_frame(), freehand)
-    _write(result, out, overlay or out.with_name(f"{out.stem}-overlay.png"))
+    reading, own = _read(source, picture, image)
+    expected = own if expected is None else expected
+    silhouette, lines = _found(reading, freehand)
+    _write(reading, silhouette, lines, out, overlay or out.with_name(f"{out.stem}-overlay.png"))
     if network:
         from stackgen.api import load
 
         model = load()
-        block_list = model.predict_blocks(result.silhouette)
+        block_list = model.predict_blocks(silhouette)
         print(f"block list by the network: {format_block_list(block_list, model.world.catalogue)}")
     if expected is not None:
-        print(f"IoU with the truth: {iou(result.silhouette, expected):.3f}")
+        print(f"IoU with the truth: {iou(silhouette, expected):.3f}")
 
 
-def _from_sketch(path: Path, freehand: bool) -> _Result:
-    """Read the drawing in a photo."""
-    found = read_sketch(path, PAPER_GRID)
-    silhouette = found.drawn if freehand else found.silhouette
-    overlay = _beside(_framed(found.photo, found.sheet), silhouette)
-    return _Result(silhouette, overlay, _made_of(found.cells, found.block_list))
+def _read(source: Source, picture: PictureOptions, image: Path | None) -> tuple[Reading, Mask | None]:
+    """Read the picture; return the stack's own silhouette, too, where a simulated camera looks at one."""
+    if source.simulate:
+        frame, own = _simulated(source.simulate, source)
+        return read_picture(frame, PAPER_GRID, cell_size=picture.cell_size), own
+    if source.realsense:
+        return read_picture(realsense_frame(), PAPER_GRID, cell_size=picture.cell_size), None
+    if source.depth:
+        picture = replace(picture, as_="depth")
+    if source.color and picture.as_ not in ("depth", None):
+        raise StackgenError("--color belongs to a depth frame")
+    path = image or source.depth or source.sketch
+    assert path is not None
+    reading = read_picture(path, PAPER_GRID, **vars(picture), colour=source.color)
+    if source.color and reading.kind != "depth":
+        raise StackgenError(f"--color belongs to a depth frame, and {path} is none")
+    return reading, None
 
 
-def _from_frame(frame: DepthFrame, freehand: bool, name: str = "") -> _Result:
-    """Find the structure in a frame; `name` begins the line of an error."""
-    try:
-        found = find_structure(frame, PAPER_GRID)
-    except StackgenError as error:
-        raise StackgenError(f"{name}{error}") from error
-    width, height = found.size
-    silhouette = found.as_seen if freehand else found.silhouette
-    lines = [f"structure: {1e3 * width:.0f} mm wide, {1e3 * height:.0f} mm high"]
-    if found.left_out > _LEFT_OUT:
-        lines.append(f"left out: what stands beside it and touches it nowhere, {found.left_out:.0%} of its size")
-    shown = _photo(frame)
-    shown[found.seen] = 0.55 * shown[found.seen] + 0.45 * np.array(_RED)
-    overlay = _beside(_framed(shown.astype(np.uint8), found.outline), silhouette)
-    return _Result(silhouette, overlay, (*lines, *_made_of(found.cells, found.block_list)))
+def _found(reading: Reading, freehand: bool) -> tuple[Mask, list[str]]:
+    """Set what was read on the paper's grid, in cells where it is made of them; say what was found."""
+    lines = [f"read as a {reading.describe()}", *reading.notes]
+    high = filling(reading.figure, PAPER_GRID)
+    if reading.cell is not None:
+        height, width = (edge / reading.cell for edge in reading.figure.shape)
+        if height > PAPER_GRID.height + _ROOM or width > PAPER_GRID.width + _ROOM:
+            raise StackgenError(
+                f"the structure is {width:.1f} x {height:.1f} cells, and the grid {PAPER_GRID.width} x"
+                f" {PAPER_GRID.height}; leave out --cell_size to have it scaled down"
+            )
+        high = height
+    as_seen = place(reading.figure, PAPER_GRID, high) if reading.exact is None else reading.exact
+    silhouette, cells, block_list = in_cells(as_seen, _ALIKE[reading.kind], PAPER_GRID)
+    return (as_seen if freehand else silhouette), [*lines, *_made_of(cells, block_list)]
 
 
 def _made_of(cells: Ints | None, block_list: Ints | None) -> tuple[str, ...]:
@@ -139,31 +143,15 @@ def _made_of(cells: Ints | None, block_list: Ints | None) -> tuple[str, ...]:
     return f"cells:\n{drawn}", f"block list by the heuristic: {format_block_list(block_list, PAPER_CATALOGUE)}"
 
 
-def _simulated(path: Path, number: int, elevation: float, azimuth: float, seed: int) -> tuple[DepthFrame, Mask]:
+def _simulated(path: Path, source: Source) -> tuple[DepthFrame, Mask]:
     """Simulate the camera before a stack of a file; return the frame and the stack's own silhouette."""
     content = read_stacks(path)
-    if not 1 <= number <= len(content.stacks):
-        raise StackgenError(f"{path}: --stack must lie in 1..{len(content.stacks)}, got {number}")
-    stack = content.stacks[number - 1]
-    frame = simulated_frame(stack, Rig(elevation=elevation, azimuth=azimuth), content.cell_size, seed)
-    whole = silhouette_of(stack, PAPER_GRID, "front", PAPER_GRID.image_size)
-    return frame, read_silhouette(whole, PAPER_GRID, exact=False)
-
-
-def _photo(frame: DepthFrame) -> Floats:
-    """Return the frame's colours (H, W, 3), or its depth in grey where it has none."""
-    if frame.colour is not None:
-        return frame.colour.astype(np.float64)
-    near = np.where(frame.depth > 0, frame.depth, frame.depth.max())
-    grey = 255 * (near.max() - near) / max(float(np.ptp(near)), 1e-6)
-    return np.repeat(grey[..., None], 3, axis=2)
-
-
-def _framed(picture: Picture, corners: Floats) -> Picture:
-    """Draw a red quadrangle into a picture."""
-    framed = np.ascontiguousarray(picture)
-    cv2.polylines(framed, [np.round(corners).astype(np.int32)], True, _RED, max(1, picture.shape[1] // 300))
-    return framed
+    if not 1 <= source.stack <= len(content.stacks):
+        raise StackgenError(f"{path}: --stack must lie in 1..{len(content.stacks)}, got {source.stack}")
+    stack = content.stacks[source.stack - 1]
+    rig = Rig(elevation=source.elevation, azimuth=source.azimuth)
+    frame = simulated_frame(stack, rig, content.cell_size, source.seed)
+    return frame, fitted(silhouette_of(stack, PAPER_GRID, "front", PAPER_GRID.image_size), PAPER_GRID)
 
 
 def _beside(picture: Picture, silhouette: Mask) -> Picture:
@@ -173,22 +161,25 @@ def _beside(picture: Picture, silhouette: Mask) -> Picture:
     return np.concatenate([picture, np.repeat(large[..., None], 3, axis=2)], axis=1)
 
 
-def _write(result: _Result, out: Path, overlay: Path) -> None:
+def _write(reading: Reading, silhouette: Mask, lines: Sequence[str], out: Path, overlay: Path) -> None:
     """Write both pictures, and print what was found."""
-    save_image(out, result.silhouette)
-    save_image(overlay, result.overlay)
-    print(*result.lines, f"wrote {out}", f"wrote {overlay}", sep="\n")
+    save_image(out, silhouette)
+    save_image(overlay, _beside(reading.overlay, silhouette))
+    print(*lines, f"wrote {out}", f"wrote {overlay}", sep="\n")
 
 
 COMMAND = Command(
     "capture",
     main,
     """
-    stackgen capture --sketch examples/photos/sketch-house.jpg --out house.png
-    stackgen capture --depth examples/photos/stack-castle-depth.png --out castle.png
+    stackgen capture examples/photos/sketch-house.jpg --out house.png
+    stackgen capture photo.jpg --as photo --which 2 --out second.png
+    stackgen capture --depth examples/photos/stack-castle-depth.png --cell_size 0.05 --out castle.png
     stackgen capture --simulate examples/stacks/arch.json --elevation 15 --out arch.png
     stackgen capture --realsense --out seen.png
     """,
+    files=Files("image", "IMAGE", "Drawing, photo of a sketch, or depth frame.", optional=True),
+    settings={"source": Source, "picture": PictureOptions},
     flags={
         "realsense": "Take a frame from the first RealSense camera.",
         "freehand": "Write the silhouette as drawn or seen, not that of the cells it is made of.",

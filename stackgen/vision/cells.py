@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.geometry import iou
-from stackgen.vision.drawings import grid_offset, read_silhouette
-from stackgen.vision.masks import bounding_box
+from stackgen.vision.drawings import grid_offset
+from stackgen.vision.masks import bounding_box, fitted
 from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, Grid, Mask
 
 Ints = NDArray[np.int64]
@@ -41,7 +41,7 @@ def in_cells(as_read: Mask, alike: float, grid: Grid) -> tuple[Mask, Ints | None
     whole = picture_of(cells, grid)
     if iou(whole, picture) < alike:
         return as_read, None, None
-    return read_silhouette(whole, grid, exact=False), cells, block_list_of(cells)
+    return fitted(whole, grid), cells, block_list_of(cells)
 
 
 def stretched(silhouette: Mask, grid: Grid) -> Mask:

@@ -2,9 +2,8 @@
 
 The background goes by depth: wall and table are planes, found along the picture's edges, and what stands clearly
 before the one and on the other is the structure. Its front is a plane, too; drawn as seen straight on from far away, a
-camera that is near, looks down or stands to one side does no harm. Then, as in the paper: a median filter, the largest
-component, resized and pasted onto the grid. What is nearly made of whole cells is taken to be: samplers know their
-edges.
+camera that is near, looks down or stands to one side does no harm. Then, as in the paper: a median filter and the
+largest component.
 
 Camera frame: x to the right, y down, z away from the camera. Lengths in metres; H x W pixels.
 """
@@ -14,17 +13,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.vision.cells import Ints, in_cells
-from stackgen.vision.drawings import Picture, read_picture, read_silhouette
-from stackgen.vision.masks import bounding_box, largest, smoothed
-from stackgen.world import Grid, Mask
+from stackgen.vision.images import Levels, Picture, Raster
+from stackgen.vision.masks import bounding_box, components, largest, smoothed
+from stackgen.world import Mask
 
 Floats = NDArray[np.float64]
 
@@ -52,14 +49,11 @@ MEDIAN = 5
 JOINT = 0.010
 """Parts of the structure nearer than this belong together [m]: between blocks side by side depth often fails."""
 
-ALIKE = 0.85
-"""Least IoU with the stretched silhouette for the structure to count as made of whole cells."""
-
 _EDGE = 0.12
 """Width of the strip along the picture's edge in which wall and table are looked for [share]."""
 
-_DTYPES = (np.uint16, np.int32, np.int64, np.float32, np.float64)
-"""Kinds of numbers that a depth file may hold."""
+LARGE, SMALL = 0.6, 0.03
+"""Sizes of structures that are not believed without being told the unit of the depth [m]."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +84,7 @@ class DepthFrame:
         if (depth > 0).mean() < 0.05:
             raise StackgenError(
                 "the frame has no depth: fewer than 5 % of its pixels have a reading between 0 and "
-                f"{FAR:g} m; is the camera covered or too near, or the file in another unit?"
+                f"{FAR:g} m; is the camera covered or too near, or the depth in another unit (--depth_scale)?"
             )
         if self.colour is not None and self.colour.shape[:2] != depth.shape:
             raise StackgenError(
@@ -109,12 +103,28 @@ class DepthFrame:
         column, row = self.center or (width / 2, height / 2)
         return focal, column, row
 
+    def shown(self) -> Picture:
+        """Return the frame's colours (H, W, 3), or its depth in grey where it has none."""
+        if self.colour is not None:
+            return self.colour.copy()
+        near = np.where(self.depth > 0, self.depth, self.depth.max())
+        grey = 255 * (near.max() - near) / max(float(np.ptp(near)), 1e-6)
+        return np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
+
     def points(self) -> Floats:
         """Return the point (H, W, 3) of each pixel in the camera frame [m]; the origin where there is no reading."""
+        return self._rays() * self.depth[..., None]
+
+    def on_plane(self, pixels: Mask, plane: Floats) -> Floats:
+        """Return the points (n, 3) [m] where the rays of some pixels (H, W) meet a plane n p = 1 [1/m]."""
+        rays = self._rays()[pixels]
+        return np.asarray(rays / (rays @ plane)[:, None])
+
+    def _rays(self) -> Floats:
+        """Return the point (H, W, 3) at depth 1 of each pixel."""
         focal, column, row = self.camera
         rows, columns = np.mgrid[: self.depth.shape[0], : self.depth.shape[1]] + 0.5
-        rays = np.stack([(columns - column) / focal, (rows - row) / focal, np.ones_like(rows)], -1)
-        return rays * self.depth[..., None]
+        return np.stack([(columns - column) / focal, (rows - row) / focal, np.ones_like(rows)], -1)
 
 
 @dataclass(frozen=True)
@@ -122,98 +132,113 @@ class SeenStructure:
     """The structure that was found in a depth frame.
 
     Args:
-        silhouette: (H, W) on the grid: that of the cells where the structure is made of whole cells, else as seen.
-        as_seen: (H, W) on the grid, as seen.
-        cells: (rows, columns) EMPTY, FULL or TRIANGLE, the first row on the ground; None where the structure is not
-            made of whole cells.
-        block_list: (S,) block list guessed from the cells; None without cells, or with too many.
         seen: (H, W) of the frame: pixels of the structure.
         front: (h, w) the structure's front as seen straight on, `PIXEL` a pixel.
         outline: (4, 2) corners of that picture in the frame [pixel], from the upper left clockwise.
         size: Width and height of the structure [m].
         left_out: What stands beside the structure and touches it nowhere, as a share of it.
+        failing: Share of the structure without a reading that was taken to belong to it.
     """
 
-    silhouette: Mask
-    as_seen: Mask
-    cells: Ints | None
-    block_list: Ints | None
     seen: Mask
     front: Mask
     outline: Floats
     size: tuple[float, float]
     left_out: float
+    failing: float
 
 
-def find_structure(frame: DepthFrame, grid: Grid) -> SeenStructure:
-    """Find the structure in a depth frame, and its silhouette.
-
-    Args:
-        frame: Frame of a camera in front of the structure.
-        grid: Scale and place of the silhouette.
+def find_structure(frame: DepthFrame) -> SeenStructure:
+    """Find the structure in a depth frame, a camera's in front of it.
 
     Raises:
         StackgenError: If nothing stands in front of the background, or the structure has no plane front.
     """
     planes = _background(frame)
-    foreground = smoothed(in_front(frame, planes), MEDIAN) & (frame.depth > 0)
+    foreground = smoothed(in_front(frame, planes) & _supported(frame), MEDIAN) & (frame.depth > 0)
     if foreground.mean() < 5e-4:
         raise StackgenError(
             f"nothing stands in front of the background: no block is nearer than it by {1e3 * IN_FRONT:g} mm"
         )
     pixels_per_metre = frame.camera[0] / float(np.median(frame.depth[foreground]))
     seen = largest(foreground, round(JOINT * pixels_per_metre))
-    picture, outline = _straight_on(frame, seen, planes)
+    holes = _failed_within(frame, seen)
+    picture, outline = _straight_on(frame, seen, holes, planes)
     front = largest(smoothed(picture, MEDIAN), round(JOINT / PIXEL))
     rows, columns = bounding_box(front)
     size = ((columns.stop - columns.start) * PIXEL, (rows.stop - rows.start) * PIXEL)
-    as_seen = read_silhouette(front, grid, exact=False)
-    silhouette, cells, block_list = in_cells(as_seen, ALIKE, grid)
-    left_out = np.count_nonzero(foreground & ~seen) / np.count_nonzero(seen)
-    return SeenStructure(silhouette, as_seen, cells, block_list, seen, front, outline, size, left_out)
+    whole = np.count_nonzero(seen)
+    left_out = np.count_nonzero(foreground & ~seen) / whole
+    return SeenStructure(seen | holes, front, outline, size, left_out, np.count_nonzero(holes) / whole)
 
 
-def read_frame(depth: str | Path, colour: str | Path | None = None, focal: float | None = None) -> DepthFrame:
-    """Read a depth frame from files.
+def as_frame(
+    raster: Raster, scale: float | None = None, focal: float | None = None, colour: Picture | None = None
+) -> DepthFrame:
+    """Take what a file or an array holds for a depth frame.
 
     Args:
-        depth: A .npy of floats [m] or of whole numbers [mm], or a PNG of 16 bits [mm].
+        raster: What was read; a picture of 8 bits is refused.
+        scale: Metres of a step of its values; None for 1 mm of whole numbers and 1 m of others.
+        focal: Focal length [pixel]; None for that of a RealSense D435.
         colour: Picture of the same pixels, or None.
-        focal: Focal length [pixel]; that of a RealSense D435 by default.
 
     Raises:
-        StackgenError: If a file is missing or something else, or has no depth.
+        StackgenError: If it has no depth, or a number is not positive.
     """
-    values, picture = _read_depth(Path(depth)), None if colour is None else read_picture(colour)
-    try:
-        return DepthFrame(values, picture, focal)
-    except StackgenError as error:
-        raise StackgenError(f"{depth}: {error}") from error
+    if not isinstance(raster, Levels):
+        raise StackgenError("is no depth frame but a picture of 8 bits; give a 16-bit PNG, or a .npy (H, W)")
+    if scale is not None and not 0 < scale < np.inf:
+        raise StackgenError(f"--depth_scale must be positive, the metres of a step of the values, got {scale:g}")
+    values = np.nan_to_num(raster.values.astype(np.float64), nan=0.0, posinf=0.0, neginf=0.0)
+    unit = scale if scale is not None else 1.0 if raster.values.dtype.kind == "f" else 1e-3
+    return DepthFrame(values * unit, colour, focal)
 
 
-def is_depth(path: str | Path) -> bool:
-    """Tell whether a file is a depth frame rather than a picture: a .npy, or an image of one channel of 16 bits."""
-    path = Path(path)
-    if path.suffix == ".npy" or not path.is_file():
-        return path.suffix == ".npy"
-    values = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    return values is not None and values.ndim == 2 and values.dtype == np.uint16
+def is_frame(raster: Raster) -> bool:
+    """Tell a depth frame from a picture: it has many levels, not only that of the ink and that of the paper."""
+    if not isinstance(raster, Levels) or min(raster.values.shape) < 48:
+        return False
+    values = raster.values[np.isfinite(raster.values)].astype(np.float64)
+    if not values.size:
+        return True
+    low, high = np.quantile(values, [0.005, 0.995])
+    ends = np.minimum(values - values.min(), values.max() - values) < 0.02 * max(np.ptp(values), 1e-9)
+    near = np.minimum(np.abs(values - low), np.abs(values - high)) < 0.03 * max(high - low, 1e-9)
+    return not (ends.mean() > 0.9 or (near.mean() > 0.9 and high > 0.5 * 65535))
 
 
-def _read_depth(path: Path) -> Floats:
-    """Read depths (H, W) [m]."""
-    try:
-        data = path.read_bytes()
-        if path.suffix == ".npy":
-            values = np.load(path, allow_pickle=False)
-        else:
-            values = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if data else None
-    except (OSError, ValueError, EOFError, cv2.error) as error:
-        reason = getattr(error, "strerror", None) or "it is no array of numbers"
-        raise StackgenError(f"{path}: cannot be read: {reason}") from error
-    if values is None or values.ndim != 2 or values.dtype not in _DTYPES:
-        raise StackgenError(f"{path}: is no depth frame; give a 16-bit PNG in mm, or a .npy (H, W) in m or whole mm")
-    return values.astype(np.float64) / (1 if values.dtype.kind == "f" else 1000)
+def doubted_size(found: SeenStructure) -> str | None:
+    """Say why the size of a structure is not believed; None where it is."""
+    width, height = found.size
+    if SMALL <= max(width, height) <= LARGE:
+        return None
+    return (
+        f"the structure would be {1e3 * width:.0f} x {1e3 * height:.0f} mm, so the depth seems to be in another unit;"
+        " give the metres of a step of its values, such as --depth_scale 0.00025 (or 0.001, if that is the size)"
+    )
+
+
+def _supported(frame: DepthFrame) -> Mask:
+    """Find the readings (H, W) with others beside them at their depth: flying pixels hang between near and far."""
+    depth = np.pad(frame.depth, 1)
+    height, width = frame.depth.shape
+    near = np.zeros((height, width), dtype=np.int64)
+    for row in range(3):
+        for column in range(3):
+            beside = depth[row : row + height, column : column + width]
+            near += np.abs(beside - frame.depth) < 0.012 * np.maximum(frame.depth, 0.5)
+    return np.asarray(near >= 5) & (frame.depth > 0)  # itself is one of them
+
+
+def _failed_within(frame: DepthFrame, seen: Mask) -> Mask:
+    """Find the holes (H, W) of what is seen where readings fail rather than show what is behind."""
+    labels, areas = components(~seen, connectivity=4)
+    failed = np.bincount(labels[frame.depth <= 0], minlength=len(areas))
+    edge = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
+    holes = failed > 0.5 * np.maximum(areas, 1)
+    holes[edge] = holes[0] = False
+    return np.asarray(holes[labels])
 
 
 def in_front(frame: DepthFrame, planes: Sequence[Floats | None]) -> Mask:
@@ -276,10 +301,13 @@ def _plane_of_most(points: Floats, tolerance: float = 0.012, rounds: int = 200) 
     return np.asarray(np.linalg.lstsq(terms[fits], values[fits], rcond=None)[0])
 
 
-def _straight_on(frame: DepthFrame, seen: Mask, planes: tuple[Floats | None, Floats | None]) -> tuple[Mask, Floats]:
+def _straight_on(
+    frame: DepthFrame, seen: Mask, holes: Mask, planes: tuple[Floats | None, Floats | None]
+) -> tuple[Mask, Floats]:
     """Draw the structure as seen straight on from far away, and find that picture's corners (4, 2) in the frame.
 
     Its points are projected along the normal of its front: tops and sides of blocks fall on the edges of their fronts.
+    Where readings fail within it, its front is taken to go on.
     """
     points = frame.points()[seen]
     plane = _plane_of_most(points)
@@ -287,6 +315,7 @@ def _straight_on(frame: DepthFrame, seen: Mask, planes: tuple[Floats | None, Flo
         raise StackgenError("the structure has no plane front: place the camera before it, and the blocks in one plane")
     right, up = _axes(plane, planes[1])
     normal = np.cross(right, up)  # towards the camera
+    points = np.concatenate([points, frame.on_plane(holes, plane)])
     middle = np.median(points, axis=0)
     origin = middle + (1 - middle @ plane) / (plane @ normal) * normal
     x, y = (points - origin) @ right, (origin - points) @ up

@@ -1,205 +1,158 @@
-"""From any picture of a structure to the silhouette that the models know.
+"""The ink of a drawing on an even ground: what differs from the background, whatever its colours.
 
-The structure is whatever differs from the background, and the background is what lies along the
-picture's edge. So polarity, colours and paper do not matter, and nothing has to be declared.
+The background is what lies along the picture's edge, less a border that was drawn there. Where the structure fills the
+edge, too, as in a tight crop, the paler of both is the background.
+
+Legend: H x W pixels, C channels.
 """
 
 from __future__ import annotations
 
-import warnings
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
+from stackgen.vision.images import SMALLEST, Image8
 from stackgen.vision.masks import bounding_box, components
 from stackgen.world import Grid, Mask
 
-if TYPE_CHECKING:
-    from PIL.Image import Image
-
 Levels = NDArray[np.float32]
-Picture = NDArray[np.uint8]
 
-_WORK_SIZE = 768  # longer edge [pixel] every picture is brought to, so that edges are found to a fraction of a pixel
-_SMALLEST = 8  # [pixel], of the picture and of the structure in it
+WORK_SIZE = 768
+"""Longer edge [pixel] every picture is brought to, so that edges are found to a fraction of a pixel."""
+
 _SPECK = 0.005  # parts, and holes, under this share of the largest part are dirt
 _CONTRAST = 20.0  # the least difference from the background that counts [of 255]
 _EDGE_BAND = 0.02  # width of the strip along the edge that shows the background [of the shorter edge]
+_BORDER = 0.03  # greatest width of a line along the picture's edge [of that edge]
 
 
-def read_silhouette(source: str | Path | ArrayLike, grid: Grid, exact: bool | None = None) -> Mask:
-    """Read the front silhouette (H, W) from a picture, scaled and placed as the grid wants it.
-
-    The structure is scaled, its proportions kept, until it is as high as the grid, or as wide where
-    it would become wider than the grid; it is set on the ground line and centred. A pixel is set when
-    at least half of it is covered.
-
-    A picture that already is a silhouette of this grid is taken as it is: `image_size` pixels square,
-    two values only, its structure's lowest row on the ground line, nothing on the picture's edge, and
-    as high or as wide as the grid to within half a cell.
+@dataclass(frozen=True)
+class Drawn:
+    """What differs from the background.
 
     Args:
-        source: An image file, or an array: (H, W) bool with True where the structure is, or grey
-            (H, W), or uint8 colour (H, W, 3) or (H, W, 4).
-        grid: Scale and place of the result.
-        exact: True takes the picture as it is (its size and two values suffice then), False always
-            scales it, None decides by the rule above.
+        ink: (H, W) at about `WORK_SIZE`.
+        darkness: (H, W) how much it differs, 0..1.
+        scale: Pixels of `ink` for one of the picture as it was read.
+        place: (left, top) of `ink` in the picture as it was read [pixel].
+        notes: What is doubtful, a sentence each.
+    """
+
+    ink: Mask
+    darkness: NDArray[np.float32]
+    scale: float
+    place: tuple[int, int]
+    notes: tuple[str, ...]
+
+
+def find_drawn(image: Image8) -> Drawn:
+    """Find what is drawn.
 
     Raises:
-        StackgenError: If the picture cannot be read, is empty, or is filled to its edges.
-
-    >>> tower = np.zeros((100, 80), bool)
-    >>> tower[20:60, 10:20] = True  # four times as high as wide
-    >>> placed = read_silhouette(tower, Grid())
-    >>> placed.shape, int(placed.sum()), int(placed[59].sum())
-    ((64, 64), 784, 14)
+        StackgenError: If nothing is, or everything.
     """
-    is_file = isinstance(source, str | Path)
-    try:
-        difference, scale = _difference(source)
-        plain = difference.shape == (grid.image_size,) * 2 and len(np.unique(difference)) == 2
-        if exact and not plain:
-            raise StackgenError(
-                f"to be taken as it is a picture must be {grid.image_size} x {grid.image_size} pixels of two values;"
-                " leave exact out to have it scaled"
-            )
-        if plain and exact is not False and (exact or _fits(difference > 0, grid)):
-            return difference > 0
-        return _place(_structure(difference, scale), grid)
-    except StackgenError as error:
-        raise StackgenError(f"{source if is_file else 'the picture'}: {error}") from error
-
-
-def read_picture(path: str | Path) -> Picture:
-    """Read a colour picture (H, W, 3), upright.
-
-    Raises:
-        StackgenError: If the file is no picture.
-    """
-    try:
-        return np.array(_open(Path(path)).convert("RGB"))
-    except StackgenError as error:
-        raise StackgenError(f"{path}: {error}") from error
-
-
-def _difference(source: str | Path | ArrayLike) -> tuple[Levels, float]:
-    """Return how much each pixel (H, W) differs from the background [0..255], and the scale of the reduced picture."""
-    if isinstance(source, str | Path):
-        picture = _open(Path(source))
-    else:
-        array = np.asarray(source)
-        if array.ndim == 2 and array.dtype == bool:
-            if min(array.shape) < _SMALLEST:
-                raise _too_small("it", array.shape[1], array.shape[0])
-            if array.all() or not array.any():
-                raise StackgenError(f"{'everything' if array.any() else 'nothing'} is set; draw a structure")
-            return array.astype(np.float32) * 255, 1.0
-        picture = _from_array(array)
-    if min(picture.size) < _SMALLEST:
-        raise _too_small("it", *picture.size)
-    if picture.mode not in ("L", "RGB") or "transparency" in picture.info:
-        picture = picture.convert("RGBA")  # the numbers of a palette cannot be averaged
-    factor = -(-max(picture.size) // _WORK_SIZE)
-    colours, alpha = _channels(picture.reduce(factor) if factor > 1 else picture)
-    # Where part of a picture is transparent, that part or the rest is the structure: colour says no more.
-    levels = alpha if 0.05 < (alpha < 128).mean() < 0.999 else colours
-    return _unlike_background(levels), 1.0 / factor
-
-
-def _open(path: Path) -> Image:
-    """Open the first frame of an image file, upright; 16-bit and float grey become 8-bit."""
-    from PIL import Image, ImageOps, UnidentifiedImageError
-
-    try:
-        if path.is_dir():
-            raise StackgenError("is a folder; give an image file")
-        if path.stat().st_size == 0:
-            raise StackgenError("is an empty file; give a PNG or JPEG image")
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            with Image.open(path) as image:
-                image.load()
-                upright = ImageOps.exif_transpose(image)
-        return _from_array(np.asarray(upright)) if upright.mode in ("I", "F") or ";" in upright.mode else upright
-    except FileNotFoundError:
-        raise StackgenError("no such file") from None
-    except UnidentifiedImageError:
-        raise StackgenError("is not an image that can be read; give a PNG or JPEG file") from None
-    except Image.DecompressionBombError:
-        raise StackgenError("has too many pixels; scale it down first") from None
-    except (OSError, ValueError, SyntaxError, EOFError, MemoryError) as error:
-        reason = getattr(error, "strerror", None) or str(error).splitlines()[:1] or ["damaged"]
-        reason = reason if isinstance(reason, str) else reason[0]
-        raise StackgenError(f"cannot be read ({reason}); the file may be cut short, save it again") from None
-
-
-def _from_array(array: NDArray[Any]) -> Image:
-    """Convert an array of grey (H, W) or uint8 colour (H, W, 3 or 4) to an image."""
-    from PIL import Image
-
-    is_grey = array.ndim == 2 and array.max(initial=0) > 1  # 0 and 1 alone are a mask, and stretched below
-    is_colour = array.ndim == 3 and array.shape[2] in (3, 4) and array.size > 0
-    if array.dtype == np.uint8 and (is_grey or is_colour):
-        return Image.fromarray(array)
-    if array.ndim != 2 or array.dtype.kind not in "biuf" or not array.size:
-        raise StackgenError(
-            f"an array must be (H, W) grey or bool, or (H, W, 3 or 4) uint8, got {array.dtype} {array.shape}"
-        )
-    values = array.astype(np.float64)
-    if not np.isfinite(values).all():
-        raise StackgenError("holds values that are not finite; replace them by 0")
-    low, spread = values.min(), np.ptp(values)
-    return Image.fromarray(np.round((values - low) * (255 / spread if spread else 0)).astype(np.uint8))
-
-
-def _channels(picture: Image) -> tuple[Levels, Levels]:
-    """Split into colour on white (H, W, 3) and opacity (H, W, 1), both 0..255."""
-    rgba = np.asarray(picture.convert("RGBA"), dtype=np.float32)
-    alpha = rgba[..., 3:]
-    return (rgba[..., :3] * (alpha / 255) + (255 - alpha)).astype(np.float32), alpha
-
-
-def _unlike_background(levels: Levels) -> Levels:
-    """Return the largest difference (H, W) of any channel of `levels` (H, W, C) from the background's.
-
-    The background is the median along the picture's upper, left and right edges: structures often
-    stand on the lower one. Taking the largest channel makes colours of equal brightness differ, and
-    stays linear over a blurred edge, so that half of it is the edge's middle.
-    """
-    band = max(1, round(min(levels.shape[:2]) * _EDGE_BAND))
-    edges = (levels[:band], levels[:, :band], levels[:, -band:])
-    border = np.concatenate([edge.reshape(-1, levels.shape[2]) for edge in edges])
-    return np.abs(levels - np.median(border, axis=0)).max(axis=2)
-
-
-def _structure(difference: Levels, scale: float) -> Mask:
-    """Cut the structure's pixels out to their bounding box, at 768 pixels for the picture's longer edge."""
-    import cv2
-
-    enlarge = max(1.0, _WORK_SIZE / max(difference.shape))
-    if enlarge > 1:
-        height, width = (round(n * enlarge) for n in difference.shape)
-        difference = np.asarray(cv2.resize(difference, (width, height), interpolation=cv2.INTER_LINEAR), np.float32)
+    levels, place = _framed(*_levels(image))
+    difference, notes = _unlike_background(levels)
+    scale = WORK_SIZE / max(difference.shape)
+    difference = _resized(difference, scale)
     if np.quantile(difference, 0.999) < _CONTRAST:
         raise StackgenError("is all one colour, so nothing or everything is in it; draw a structure on a background")
-    mask = _clean(difference > _threshold(difference))
-    if mask.mean() > 0.98:
+    ink = _clean(difference > _threshold(difference))
+    if ink.mean() > 0.98:
         raise StackgenError("the structure fills the whole frame; leave some background around it")
-    if not mask.any():
+    if not ink.any():
         raise StackgenError("nothing but specks is in it; draw a structure on a background")
-    cut = mask[bounding_box(mask)]
-    if max(cut.shape) < _SMALLEST * enlarge * scale:
-        raise _too_small("the structure in it", *(round(n / (enlarge * scale)) for n in cut.shape[::-1]))
-    return cut
+    extent = max(ink[bounding_box(ink)].shape) / scale * image.factor
+    if extent < SMALLEST:
+        rows, columns = ink[bounding_box(ink)].shape
+        raise StackgenError(
+            f"the structure in it is only {columns / scale * image.factor:.0f} x {rows / scale * image.factor:.0f}"
+            f" pixels; at least {SMALLEST} are needed, draw or scan it larger"
+        )
+    return Drawn(ink, (difference / 255).astype(np.float32), scale, place, notes)
 
 
-def _too_small(what: str, width: int, height: int) -> StackgenError:
-    return StackgenError(
-        f"{what} is only {width} x {height} pixels; at least {_SMALLEST} are needed, draw or scan it larger"
-    )
+def _levels(image: Image8) -> tuple[Levels, tuple[int, int]]:
+    """Return colours (H, W, 3) or opacity (H, W, 1), whichever shows the structure, and their place in the picture.
+
+    Where part of a picture is transparent, that part or the rest is the structure, unless the rest is a rectangle
+    with something in it.
+    """
+    colours = image.colours.astype(np.float32)
+    if image.alpha is None:
+        return colours, (0, 0)
+    opaque = image.alpha >= 128
+    if opaque.mean() > 0.9995 or not opaque.any():
+        return colours, (0, 0)
+    rows, columns = bounding_box(opaque)
+    inside = colours[rows, columns]
+    if opaque[rows, columns].mean() > 0.97 and min(inside.shape[:2]) >= SMALLEST:
+        seen = inside[opaque[rows, columns]]
+        if (np.quantile(seen, 0.995, axis=0) - np.quantile(seen, 0.005, axis=0)).max() > _CONTRAST:
+            inside = np.where(opaque[rows, columns, None], inside, np.median(seen, axis=0)).astype(np.float32)
+            return inside, (columns.start, rows.start)
+    return image.alpha[..., None].astype(np.float32), (0, 0)
+
+
+def _framed(levels: Levels, place: tuple[int, int]) -> tuple[Levels, tuple[int, int]]:
+    """Cut off lines along the picture's edges: thin, of one colour from end to end, unlike what is beside them."""
+    top, bottom, left, right = 0, levels.shape[0], 0, levels.shape[1]
+    for _ in range(2):  # a border's corners show once a neighbouring side is gone
+        part = levels[top:bottom, left:right]
+        widths = [_border(np.rot90(part, turns)) for turns in range(4)]  # of the top, right, bottom and left
+        top, right, bottom, left = top + widths[0], right - widths[1], bottom - widths[2], left + widths[3]
+    return levels[top:bottom, left:right], (place[0] + left, place[1] + top)
+
+
+def _border(levels: Levels) -> int:
+    """Return the width of a line along the upper edge [pixel], 0 where there is none."""
+    most = max(2, round(_BORDER * len(levels)))
+    if len(levels) < 4 * most:
+        return 0
+    rows = levels[: 2 * most + 2]
+    tones = np.median(rows, axis=1)
+    even = (np.abs(rows - tones[:, None]).max(axis=2) < _CONTRAST).mean(axis=1) > 0.95
+    after = np.median(rows[most:].reshape(-1, rows.shape[2]), axis=0)
+    unlike = np.abs(tones - after).max(axis=1) > _CONTRAST
+    line = even & unlike
+    if not line[0] or line.all():
+        return 0
+    width = int(np.argmin(line))
+    soft = int((~even[width:]).argmin()) if not even[width] else 0
+    return width + min(soft, 2) if width <= most else 0
+
+
+def _resized(difference: Levels, scale: float) -> Levels:
+    import cv2
+
+    height, width = (max(1, round(n * scale)) for n in difference.shape)
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(difference, (width, height), interpolation=how), np.float32)
+
+
+def _unlike_background(levels: Levels) -> tuple[Levels, tuple[str, ...]]:
+    """Return the largest difference (H, W) of any channel of `levels` (H, W, C) from the background's.
+
+    The background is the median along the picture's edges; the lower one counts less, as structures often stand on
+    it. Taking the largest channel makes colours of equal brightness differ, and stays linear over a blurred edge, so
+    that half of it is the edge's middle.
+    """
+    band = max(1, round(min(levels.shape[:2]) * _EDGE_BAND))
+    edges = [levels[:band], levels[:, :band], levels[:, -band:], levels[-band:]]
+    border = np.concatenate([edge.reshape(-1, levels.shape[2]) for edge in edges[:3]])
+    background = np.median(border, axis=0)
+    notes: tuple[str, ...] = ()
+    around = np.concatenate([edge.reshape(-1, levels.shape[2]) for edge in edges])
+    other = around[np.abs(around - background).max(axis=1) > 3 * _CONTRAST]
+    if levels.shape[2] == 3 and len(other) > 0.02 * len(around):
+        tone = np.median(other, axis=0)
+        if tone.min() > 165 and background.mean() < 128 and (np.abs(other - tone).max(axis=1) < _CONTRAST).mean() > 0.6:
+            background = tone
+            notes = ("The picture is cut off along its edges; what is dark in it was taken for the structure.",)
+    return np.abs(levels - background).max(axis=2), notes
 
 
 def _threshold(difference: Levels) -> float:
@@ -248,7 +201,7 @@ def _clean(mask: Mask) -> Mask:
     return np.asarray(kept | (sizes < limit)[holes])
 
 
-def _fits(mask: Mask, grid: Grid) -> bool:
+def fits(mask: Mask, grid: Grid) -> bool:
     """Tell whether a mask (image_size square) is placed and scaled as the grid's silhouettes are."""
     rows, columns = bounding_box(mask)
     inside = rows.start > 0 and columns.start > 0 and columns.stop < grid.image_size
@@ -257,29 +210,6 @@ def _fits(mask: Mask, grid: Grid) -> bool:
     height, width = rows.stop - rows.start, columns.stop - columns.start
     fills = abs(height - grid.height * 2 * half) <= half or abs(width - grid.width * 2 * half) <= half
     return inside and on_ground and fills
-
-
-def _place(cut: Mask, grid: Grid) -> Mask:
-    """Scale a structure that is cut out to its box until it fills the grid, on the ground and centred.
-
-    OpenCV's INTER_AREA scales to whole pixels only, which moves edges: 3 of the 12 examples would change.
-    """
-    height, width = cut.shape
-    scale = grid.pixels_per_cell * min(grid.height / height, grid.width / width)  # [target pixel per pixel]
-    columns = (np.arange(grid.image_size + 1) - grid.image_size / 2) / scale + width / 2
-    rows = (np.arange(grid.image_size + 1) - (grid.image_size - grid.ground_margin)) / scale + height
-    covered = _overlap(rows, height) @ cut.astype(np.float64) @ _overlap(columns, width).T
-    placed = covered >= 0.5 - 1e-9
-    if not placed.any():
-        raise StackgenError("the structure is too thin to be seen at the grid's scale; draw it bolder")
-    return placed
-
-
-def _overlap(edges: NDArray[np.float64], length: int) -> NDArray[np.float64]:
-    """Return the share (n, length) of each interval between `edges` (n + 1) that each of `length` unit cells covers."""
-    low, high = edges[:-1, None], edges[1:, None]
-    cells = np.arange(length)
-    return np.clip(np.minimum(high, cells + 1) - np.maximum(low, cells), 0, None) / (high - low)
 
 
 def grid_offset(silhouette: Mask, grid: Grid) -> int:
@@ -309,3 +239,40 @@ def grid_offset(silhouette: Mask, grid: Grid) -> int:
         if score > best_score + 1e-9:
             best, best_score = offset, score
     return best
+
+
+def as_it_is(image: Image8, grid: Grid) -> Mask | None:
+    """Return the silhouette (image_size square) where a picture already is one of this grid, else None.
+
+    It is `image_size` pixels square, has two values only, its structure's lowest row on the ground line, nothing on the
+    picture's edge, and is as high or as wide as the grid to within half a cell.
+    """
+    levels, _ = _levels(image)
+    if image.factor != 1 or levels.shape[:2] != (grid.image_size,) * 2:
+        return None
+    difference = np.abs(levels - np.median(levels[:1].reshape(-1, levels.shape[2]), axis=0)).max(axis=2)
+    if len(np.unique(difference)) != 2:
+        return None
+    mask = difference > 0
+    return mask if fits(mask, grid) else None
+
+
+def is_flat(image: Image8) -> bool:
+    """Tell whether neighbouring pixels are equal nearly everywhere, as a drawing program leaves them and no camera."""
+    grey = image.colours.mean(axis=2)
+    steps = np.abs(np.diff(grey, axis=1))[1:], np.abs(np.diff(grey, axis=0))[:, 1:]
+    return bool(((steps[0] < 0.4) & (steps[1] < 0.4)).mean() > 0.8) and is_even(image)
+
+
+def is_even(image: Image8) -> bool:
+    """Tell whether the background is of one colour: most places along the picture's edge are alike."""
+    levels, _ = _framed(*_levels(image))
+    band = max(1, round(min(levels.shape[:2]) * 2 * _EDGE_BAND))
+    places = [
+        np.median(patch.reshape(-1, levels.shape[2]), axis=0)
+        for edge in (levels[:band], levels[-band:], levels[:, :band].swapaxes(0, 1), levels[:, -band:].swapaxes(0, 1))
+        for patch in np.array_split(edge, 8, axis=1)
+    ]
+    tones = np.array(places)
+    alike = np.abs(tones[:, None] - tones[None]).max(axis=2) < 0.6 * _CONTRAST
+    return bool(alike.mean(axis=1).max() > 0.7)

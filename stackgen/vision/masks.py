@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.world import Mask
+from stackgen.errors import StackgenError
+from stackgen.world import Grid, Mask
 
 
 def bounding_box(mask: Mask) -> tuple[slice, slice]:
@@ -60,3 +61,77 @@ def smoothed(mask: Mask, size: int) -> Mask:
     import cv2
 
     return np.asarray(cv2.medianBlur(mask.astype(np.uint8), size) > 0)
+
+
+def closed(mask: Mask, radius: float) -> Mask:
+    """Close gaps of up to twice a radius [pixel], by discs."""
+    import cv2
+
+    if radius < 0.5:
+        return mask
+    grown = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, 5) <= radius
+    return np.asarray((cv2.distanceTransform(grown.astype(np.uint8), cv2.DIST_L2, 5) > radius) | mask)
+
+
+def opened(mask: Mask, radius: float) -> Mask:
+    """Keep the parts of a mask that hold a disc of this radius [pixel]."""
+    import cv2
+
+    core = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 5) > radius
+    if not core.any():
+        return core
+    return np.asarray(cv2.distanceTransform((~core).astype(np.uint8), cv2.DIST_L2, 5) <= radius) & mask
+
+
+def place(figure: Mask, grid: Grid, cells_high: float) -> Mask:
+    """Scale a figure to so many cells, set it on the ground line and centre it; what is off the canvas is cut off.
+
+    A pixel is set when at least half of it is covered. OpenCV's INTER_AREA scales to whole pixels only, which moves
+    edges.
+
+    Args:
+        figure: (h, w), cut out to its box.
+        grid: Scale and place of the result.
+        cells_high: Height of the figure [cell].
+
+    Returns:
+        (image_size, image_size) silhouette.
+
+    Raises:
+        StackgenError: If nothing of it is left at this scale.
+
+    >>> int(place(np.ones((40, 20), bool), Grid(), 2).sum())
+    392
+    """
+    height, width = figure.shape
+    scale = grid.pixels_per_cell * cells_high / height  # [target pixel per pixel]
+    columns = (np.arange(grid.image_size + 1) - grid.image_size / 2) / scale + width / 2
+    rows = (np.arange(grid.image_size + 1) - (grid.image_size - grid.ground_margin)) / scale + height
+    covered = _overlap(rows, height) @ figure.astype(np.float64) @ _overlap(columns, width).T
+    placed = np.asarray(covered >= 0.5 - 1e-9)
+    if not placed.any():
+        raise StackgenError("the structure is too thin to be seen at the grid's scale; draw it bolder")
+    return placed
+
+
+def filling(figure: Mask, grid: Grid) -> float:
+    """Return the height [cell] at which a figure (h, w) is as high as the grid, or as wide where it would be wider."""
+    height, width = figure.shape
+    return min(float(grid.height), grid.width * height / width)
+
+
+def fitted(mask: Mask, grid: Grid) -> Mask:
+    """Scale what is set in a mask (H, W) until it fills the grid, on the ground line and centred.
+
+    Raises:
+        StackgenError: If nothing is left of it at this scale.
+    """
+    figure = mask[bounding_box(mask)]
+    return place(figure, grid, filling(figure, grid))
+
+
+def _overlap(edges: NDArray[np.float64], length: int) -> NDArray[np.float64]:
+    """Return the share (n, length) of each interval between `edges` (n + 1) that each of `length` unit cells covers."""
+    low, high = edges[:-1, None], edges[1:, None]
+    cells = np.arange(length)
+    return np.clip(np.minimum(high, cells + 1) - np.maximum(low, cells), 0, None) / (high - low)

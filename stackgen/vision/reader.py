@@ -1,5 +1,8 @@
 """The one reader of pictures: a drawing, the photo of a sketch or a depth frame becomes a figure.
 
+A frame has one channel of more than 256 levels. A photo shows a sheet of paper, or light that changes from place to
+place; everything else is a drawing. Nothing is tried a second time in another way: what is refused is refused.
+
 Legend: H x W pixels of the picture, h x w of the figure.
 """
 
@@ -7,25 +10,38 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.geometry import iou
-from stackgen.vision import drawings
-from stackgen.vision.depth import find_structure, is_depth, read_frame
-from stackgen.vision.drawings import Picture, read_silhouette
-from stackgen.vision.masks import bounding_box
-from stackgen.vision.sketches import read_sketch
+from stackgen.vision import depth, drawings, images
+from stackgen.vision.depth import DepthFrame
+from stackgen.vision.images import Image8, Picture
+from stackgen.vision.lines import without_rules
+from stackgen.vision.masks import bounding_box, filling, place
+from stackgen.vision.outlines import Filled, choose
+from stackgen.vision.photos import WORK_SIZE, read_page
+from stackgen.vision.sheets import Sheet, find_sheet
 from stackgen.world import Grid, Mask
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+__all__ = ["PictureKind", "PictureOptions", "Reading", "filling", "place", "read_picture", "read_silhouette"]
 
 PictureKind = Literal["drawing", "photo", "depth"]
 
 FIGURE = 512
 """Longer edge of a figure [pixel], about."""
+
+_LEFT_OUT = 0.05
+"""Share of the structure from which on what was left out, or added, is worth telling."""
+
+_GREEN = (20, 160, 60)
+_RED = (214, 39, 40)
 
 
 @dataclass(frozen=True)
@@ -37,7 +53,7 @@ class Reading:
             `FIGURE` of them.
         kind: What the picture was taken for.
         confidence: How sure the reader is, 0..1.
-        overlay: (H, W, 3) uint8, the picture with the outline of what was read.
+        overlay: (H, W, 3) uint8, the picture with the outline of what was read in red, and that of the sheet in green.
         notes: What was left out or is doubtful, a sentence each.
         cell: Edge of a cell in pixels of `figure` where it is known, else None.
         exact: (image_size, image_size) the silhouette itself where the picture already is one of the grid's, else None.
@@ -51,83 +67,202 @@ class Reading:
     cell: float | None = None
     exact: Mask | None = None
 
+    def describe(self) -> str:
+        """Name what the picture was taken for, and how sure the reader is.
+
+        >>> Reading(np.ones((512, 128), bool), "photo", 0.9, np.zeros((60, 80, 3), np.uint8)).describe()
+        'photo of a sketch (confidence 90%)'
+        """
+        kinds = {"drawing": "drawing", "photo": "photo of a sketch", "depth": "depth frame"}
+        return f"{kinds[self.kind]} (confidence {self.confidence:.0%})"
+
+
+@dataclass(frozen=True)
+class PictureOptions:
+    """What the user says of a picture, as arguments of :func:`read_picture`.
+
+    Args:
+        as_: What to take the picture for: a drawing, the photo of a sketch, or a depth frame; told apart by default.
+        which: Number of the drawing to read, from the left, where there are several.
+        depth_scale: Metres of a step of a depth frame's values, such as 0.00025; by default whole numbers are
+            millimetres and others are metres.
+        focal: Focal length of a depth frame [pixel]; that of a RealSense D435 by default.
+        cell_size: Edge of a cube before a depth camera [m], with which the structure keeps its scale.
+    """
+
+    as_: PictureKind | None = None
+    which: int | None = None
+    depth_scale: float | None = None
+    focal: float | None = None
+    cell_size: float | None = None
+
 
 def read_picture(
-    source: str | Path | ArrayLike, grid: Grid, as_: PictureKind | None = None, which: int | None = None
+    source: str | Path | ArrayLike | Image | DepthFrame,
+    grid: Grid,
+    as_: PictureKind | None = None,
+    which: int | None = None,
+    *,
+    depth_scale: float | None = None,
+    focal: float | None = None,
+    cell_size: float | None = None,
+    colour: str | Path | None = None,
 ) -> Reading:
     """Read what a picture shows.
 
     Args:
-        source: An image file, a depth frame (.npy or 16-bit PNG), an array as `read_silhouette` takes it, or a PIL
-            image.
+        source: An image file or a depth frame (.npy or 16-bit PNG); an array (H, W) of grey, (H, W, 3 or 4) of uint8
+            colours, or (H, W) bool with True where the structure is; a PIL image; or the frame of a camera.
         grid: Grid of the silhouettes; a picture that already is one of them is taken as it is.
         as_: What to take the picture for; None to tell.
         which: Number of the drawing, from the left, where there are several.
+        depth_scale: Metres of a step of the values of a depth frame; None for 1 mm of whole numbers and 1 m of others.
+        focal: Focal length of a depth frame [pixel]; None for that of a RealSense D435.
+        cell_size: Edge of a cell [m], with which a depth frame tells the structure's scale.
+        colour: Picture of the same pixels as a depth frame, for the overlay.
+
+    Raises:
+        StackgenError: If the picture cannot be read, nothing is seen in it, or a number makes no sense.
+    """
+    if as_ is not None and as_ not in get_args(PictureKind):
+        raise StackgenError(f"a picture is a {', a '.join(get_args(PictureKind))} frame, got {as_!r}")
+    if cell_size is not None and not 0 < cell_size < np.inf:
+        raise StackgenError(f"--cell_size must be positive, the edge of a cell in metres, got {cell_size:g}")
+    if isinstance(source, DepthFrame):
+        return _of_frame(source, True, cell_size)
+    try:
+        raster = images.load(source)
+        if as_ == "depth" or (as_ is None and depth.is_frame(raster)):
+            beside = None if colour is None else read_colours(colour)
+            frame = depth.as_frame(raster, depth_scale, focal, beside)
+            return _of_frame(frame, depth_scale is not None, cell_size)
+        image = raster if isinstance(raster, Image8) else images.as_picture(raster)
+        sheet = None if as_ == "drawing" else _sheet(image)
+        if as_ == "photo" or (as_ is None and (sheet is not None or not drawings.is_even(image))):
+            return _of_photo(image, sheet, which)
+        return _of_drawing(image, grid, which)
+    except StackgenError as error:
+        raise StackgenError(f"{images.name_of(source)}: {error}") from error
+
+
+def read_silhouette(source: str | Path | ArrayLike | Image, grid: Grid) -> Mask:
+    """Read the front silhouette (H, W) from a picture, scaled until it fills the grid.
+
+    A picture that already is a silhouette of this grid is taken as it is.
 
     Raises:
         StackgenError: If the picture cannot be read, or nothing is seen in it.
+
+    >>> tower = np.zeros((100, 80), bool)
+    >>> tower[20:60, 10:20] = True  # four times as high as wide
+    >>> placed = read_silhouette(tower, Grid())
+    >>> placed.shape, int(placed.sum()), int(placed[59].sum())
+    ((64, 64), 784, 14)
     """
-    if as_ is not None and as_ not in get_args(PictureKind):
-        raise StackgenError(f"a picture is a drawing, a photo or a depth frame, got {as_!r}")
-    if isinstance(source, str | Path) and as_ != "drawing" and (as_ == "depth" or is_depth(source)):
-        found = find_structure(read_frame(source), grid)
-        return _reading(found.front, "depth", grid)
-    sketch = None
-    if as_ != "drawing" and isinstance(source, str | Path):
-        try:
-            sketch = read_sketch(source, grid)
-        except StackgenError:
-            if as_ == "photo":
-                raise
-    if sketch is not None and (as_ == "photo" or iou(sketch.drawn, read_silhouette(source, grid)) < 0.7):
-        return _reading(sketch.ink, "photo", grid)
-    difference, scale = drawings._difference(source)
-    taken = read_silhouette(source, grid)
-    exact = taken if np.array_equal(difference > 0, taken) else None
-    return _reading(drawings._structure(difference, scale), "drawing", grid, exact)
+    reading = read_picture(source, grid)
+    return place(reading.figure, grid, filling(reading.figure, grid)) if reading.exact is None else reading.exact
 
 
-def _reading(mask: Mask, kind: PictureKind, grid: Grid, exact: Mask | None = None) -> Reading:
+def read_colours(path: str | Path) -> Picture:
+    """Read a colour picture (H, W, 3), upright, at its full size.
+
+    Raises:
+        StackgenError: If the file is no picture.
+    """
+    try:
+        raster = images.load(path)
+        return (raster if isinstance(raster, Image8) else images.as_picture(raster)).colours
+    except StackgenError as error:
+        raise StackgenError(f"{path}: {error}") from error
+
+
+def _sheet(image: Image8) -> Sheet | None:
+    """Find the sheet in what may be a photo: a picture without noise, or with transparent parts, is none."""
+    return None if image.alpha is not None or drawings.is_flat(image) else find_sheet(image.colours)
+
+
+def _of_drawing(image: Image8, grid: Grid, which: int | None) -> Reading:
+    """Read a drawing on an even ground."""
+    drawn = drawings.find_drawn(image)
+    ink, _ = without_rules(drawn.ink, drawn.darkness)
+    found = choose(ink, which, spread=True)
+    sure = found.sureness * (0.8 if drawn.notes else 1.0)
+    to_picture = np.array([[1 / drawn.scale, 0, drawn.place[0]], [0, 1 / drawn.scale, drawn.place[1]], [0, 0, 1]])
+    overlay = _outlined(image.colours, found.mask, to_picture)
+    exact = drawings.as_it_is(image, grid)
+    return Reading(_figure(found.mask), "drawing", sure, overlay, (*drawn.notes, *found.notes), exact=exact)
+
+
+def _of_photo(image: Image8, sheet: Sheet | None, which: int | None) -> Reading:
+    """Read the photo of a sketch."""
+    if min(image.colours.shape[:2]) < 64:
+        height, width = image.colours.shape[:2]
+        raise StackgenError(f"the photo is only {width} x {height} pixels; take a larger one")
+    page = read_page(image.colours, sheet)
+    found = choose(page.ink, which)
+    if _runs_off(found):
+        raise StackgenError("the drawing runs off the sheet; leave some blank paper around it")
+    notes = page.notes if sheet is not None else (*page.notes, "No sheet's edge is seen: the whole photo is the sheet.")
+    sure = found.sureness * (1.0 if sheet is None else sheet.sureness) * min(1.0, 0.5 + page.contrast)
+    overlay = _outlined(image.colours, found.mask, np.asarray(np.linalg.inv(page.turn)))
+    if sheet is not None:
+        _polygon(overlay, sheet.corners, _GREEN)
+    return Reading(_figure(found.mask), "photo", sure, overlay, (*notes, *found.notes))
+
+
+def _of_frame(frame: DepthFrame, scale_is_known: bool, cell_size: float | None) -> Reading:
+    """Find the structure in a depth frame."""
+    found = depth.find_structure(frame)
+    doubt = None if scale_is_known else depth.doubted_size(found)
+    if doubt:
+        raise StackgenError(doubt)
+    width, height = found.size
+    notes = [f"The structure is {1e3 * width:.0f} mm wide and {1e3 * height:.0f} mm high."]
+    if found.left_out > _LEFT_OUT:
+        notes.append(f"What stands beside it and touches it nowhere was left out, {found.left_out:.0%} of its size.")
+    if found.failing > _LEFT_OUT:
+        notes.append(f"Depth fails on {found.failing:.0%} of it, which was taken to belong to it.")
+    shown = frame.shown()
+    shown[found.seen] = (0.55 * shown[found.seen] + 0.45 * np.array(_RED)).astype(np.uint8)
+    _polygon(shown, found.outline, _GREEN)
+    figure = _figure(found.front)
+    cell = None if cell_size is None else cell_size / height * len(figure)
+    sure = float(np.clip(1 - found.left_out - found.failing, 0.2, 1))
+    return Reading(figure, "depth", sure, shown, tuple(notes), cell)
+
+
+def _runs_off(found: Filled) -> bool:
+    """Tell whether a drawing reaches the edge of what is seen of the sheet."""
+    mask, reach = found.mask, max(2, round(0.015 * WORK_SIZE))
+    ends = (
+        mask[:reach].any(axis=0),
+        mask[-reach:].any(axis=0),
+        mask[:, :reach].any(axis=1),
+        mask[:, -reach:].any(axis=1),
+    )
+    return any(np.count_nonzero(end) > 3 for end in ends)
+
+
+def _figure(mask: Mask) -> Mask:
+    """Cut a mask (H, W) out to its box, at `FIGURE` pixels."""
     cut = mask[bounding_box(mask)]
     scale = FIGURE / max(cut.shape)
     size = (max(1, round(cut.shape[1] * scale)), max(1, round(cut.shape[0] * scale)))
-    figure = cv2.resize(cut.astype(np.float32), size, interpolation=cv2.INTER_AREA) >= 0.5
-    overlay = np.repeat(np.where(mask, 0, 255).astype(np.uint8)[..., None], 3, axis=2)
-    return Reading(figure[bounding_box(figure)], kind, 1.0, overlay, exact=exact)
+    how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
+    figure = cv2.resize(cut.astype(np.float32), size, interpolation=how) >= 0.5
+    return np.asarray(figure[bounding_box(figure)])
 
 
-def place(figure: Mask, grid: Grid, cells_high: float) -> Mask:
-    """Scale a figure to so many cells, set it on the ground line and centre it; what is off the canvas is cut off.
-
-    A pixel is set when at least half of it is covered.
-
-    Args:
-        figure: (h, w), cut out to its box.
-        grid: Scale and place of the result.
-        cells_high: Height of the figure [cell].
-
-    Returns:
-        (image_size, image_size) silhouette.
-
-    >>> int(place(np.ones((40, 10), bool), Grid(), 2).sum())
-    196
-    """
-    height, width = figure.shape
-    scale = grid.pixels_per_cell * cells_high / height  # [target pixel per pixel]
-    columns = (np.arange(grid.image_size + 1) - grid.image_size / 2) / scale + width / 2
-    rows = (np.arange(grid.image_size + 1) - (grid.image_size - grid.ground_margin)) / scale + height
-    covered = _overlap(rows, height) @ figure.astype(np.float64) @ _overlap(columns, width).T
-    return np.asarray(covered >= 0.5 - 1e-9)
+def _outlined(picture: Picture, mask: Mask, to_picture: NDArray[np.float64]) -> Picture:
+    """Draw the outline of a mask into a picture, mapped by a (3, 3) homography."""
+    shown = picture.copy()
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    for contour in contours:
+        there = cv2.perspectiveTransform(contour.astype(np.float64) + 0.5, to_picture)
+        _polygon(shown, np.asarray(there, np.float64)[:, 0], _RED)
+    return shown
 
 
-def filling(figure: Mask, grid: Grid) -> float:
-    """Return the height [cell] at which a figure is as high as the grid, or as wide where it would become wider."""
-    height, width = figure.shape
-    return min(float(grid.height), grid.width * height / width)
-
-
-def _overlap(edges: NDArray[np.float64], length: int) -> NDArray[np.float64]:
-    """Return the share (n, length) of each interval between `edges` (n + 1) that each of `length` unit cells covers."""
-    low, high = edges[:-1, None], edges[1:, None]
-    cells = np.arange(length)
-    return np.clip(np.minimum(high, cells + 1) - np.maximum(low, cells), 0, None) / (high - low)
+def _polygon(picture: Picture, corners: NDArray[np.float64], colour: tuple[int, int, int]) -> None:
+    thick = max(1, max(picture.shape) // 300)
+    cv2.polylines(picture, [np.round(corners - 0.5).astype(np.int32)], True, colour, thick)

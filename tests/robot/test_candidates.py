@@ -16,7 +16,7 @@ from stackgen.robot.candidates import first_buildable, silhouette_of, stacks_of_
 from stackgen.robot.workcell import Staging, Workcell
 from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
-from stackgen.vision.drawings import read_silhouette
+from stackgen.vision.reader import read_silhouette
 from stackgen.viz.render import save_image
 from stackgen.world import PAPER_GRID
 from tests.conftest import TowerSampler

@@ -9,7 +9,8 @@ from types import SimpleNamespace
 
 from stackgen.geometry import silhouette
 from stackgen.stack import Stack
-from stackgen.vision import drawings
+from stackgen.vision import reader
+from stackgen.vision.masks import fitted
 from stackgen.world import PAPER_GRID, Mask
 
 ROOT = Path(__file__).parents[2]
@@ -17,12 +18,12 @@ PHOTOS = ROOT / "examples" / "photos"
 DRAWN = runpy.run_path(str(ROOT / "examples" / "draw_photos.py"))
 STACKS: dict[str, Stack] = {name: DRAWN[name] for name in ("ARCH", "CASTLE", "HOUSE")}
 ARCH, CASTLE, HOUSE = STACKS.values()
-read_silhouette = partial(drawings.read_silhouette, grid=PAPER_GRID)
+read_silhouette = partial(reader.read_silhouette, grid=PAPER_GRID)
 
 
 def truth(stack: Stack) -> Mask:
     """The stack's own silhouette, framed as read ones are."""
-    return read_silhouette(silhouette(stack, PAPER_GRID), exact=False)
+    return fitted(silhouette(stack, PAPER_GRID), PAPER_GRID)
 
 
 def camera_that_is_not_there() -> SimpleNamespace:

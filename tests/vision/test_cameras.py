@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,13 +10,11 @@ import pytest
 
 from stackgen.errors import StackgenError
 from stackgen.geometry import iou
-from stackgen.vision import depth
+from stackgen.vision.depth import find_structure
+from stackgen.vision.masks import fitted
 from stackgen.vision.cameras import realsense_frame, simulated_frame
 from stackgen.world import PAPER_GRID
 from tests.vision.conftest import CASTLE, camera_that_is_not_there, truth
-
-find_structure = partial(depth.find_structure, grid=PAPER_GRID)
-
 
 def test_without_the_package_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
@@ -48,4 +45,4 @@ def test_a_realsense_frame_is_depth_in_metres_seen_by_the_colour_camera(monkeypa
     frame = realsense_frame()
     assert np.abs(frame.depth - sent.depth).max() < 2e-4 and stopped == [True]
     assert frame.camera == (sent.focal, 320.0, 240.0)
-    assert iou(find_structure(frame).silhouette, truth(CASTLE)) >= 0.9
+    assert iou(fitted(find_structure(frame).front, PAPER_GRID), truth(CASTLE)) >= 0.9

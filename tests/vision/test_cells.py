@@ -8,8 +8,8 @@ import pytest
 from stackgen.geometry import silhouette
 from stackgen.stack import Stack
 from stackgen.vision.cells import EMPTY, FULL, TRIANGLE, block_list_of, in_cells, occupancy, picture_of
+from stackgen.vision.masks import fitted
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID
-from tests.vision.conftest import read_silhouette
 
 
 def test_cells_and_their_picture_are_inverse() -> None:
@@ -26,7 +26,7 @@ def test_blocks_that_stick_out_of_the_grid_make_no_triangles() -> None:
     long, cells = PAPER_CATALOGUE.index("long_rectangle"), np.array([[1, 1, 1, 0], [0, 1, 1, 1]] * 2)
     xs = [-0.65, 0.6, -0.5, 0.6]
     poses = np.array([[x, 0, row + 0.5, 0, 0, 0] for row, x in enumerate(xs)])
-    as_read = read_silhouette(silhouette(Stack(np.full(4, long), poses), PAPER_GRID), exact=False)
+    as_read = fitted(silhouette(Stack(np.full(4, long), poses), PAPER_GRID), PAPER_GRID)
     whole, found, _ = in_cells(as_read, 0.85, PAPER_GRID)
     assert found is not None and found.tolist() == cells.tolist()
     assert np.array_equal(whole, picture_of(cells, PAPER_GRID))

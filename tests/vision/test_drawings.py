@@ -15,11 +15,11 @@ from PIL import Image, ImageFilter
 from stackgen.errors import StackgenError
 from stackgen.geometry import iou, mirror, silhouette
 from stackgen.stack import Stack
-from stackgen.vision import drawings
+from stackgen.vision import reader
 from stackgen.vision.drawings import grid_offset
 from stackgen.world import PAPER_GRID, Grid, Mask
 
-read_silhouette = partial(drawings.read_silhouette, grid=PAPER_GRID)
+read_silhouette = partial(reader.read_silhouette, grid=PAPER_GRID)
 LARGE = Grid(image_size=480, pixels_per_cell=100, ground_margin=40)
 
 # Centred, four cells high or wide, on the ground: reading them changes nothing.
