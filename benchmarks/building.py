@@ -21,12 +21,13 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common import argument_parser, plain_table, report, start
-from stackgen.api import DEFAULT, load
+from stackgen.api import load
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.errors import StackgenError
 from stackgen.evaluation.intervals import clustered_ratio
 from stackgen.evaluation.protocol import Scene, scenes_of
+from stackgen.names import DEFAULT
 from stackgen.robot.workcell import Workcell
 from stackgen.sampling.alignment import AlignedSampler
 

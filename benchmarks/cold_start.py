@@ -65,7 +65,7 @@ def warm_runs(options: argparse.Namespace, folder: Path) -> tuple[float, dict[st
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `stackgen sample` has it; torch reads it when it is imported
     begin = time.perf_counter()
     from stackgen.api import check, load
-    from stackgen.commands.sample import write_result
+    from stackgen.commands.sample_pictures import write_result
     from stackgen.vision.reader import read_picture
 
     image, n = ROOT / options.image, options.num_samples

@@ -21,7 +21,7 @@ from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_json
 from stackgen.models.diffusion.settings import SamplerConfig
-from stackgen.protocols import CheckerName
+from stackgen.names import CheckerName
 
 KINDS = {
     "ddpm": SamplerConfig("ddpm"),

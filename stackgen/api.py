@@ -16,7 +16,8 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
 from stackgen.io.stacks_file import StackEntry, StacksFile, Weights
 from stackgen.models.diffusion.settings import SamplerConfig
-from stackgen.protocols import BlockListPredictor, CheckerName, StabilityChecker, StackSampler
+from stackgen.names import DEFAULT, CheckerName
+from stackgen.protocols import BlockListPredictor, StabilityChecker, StackSampler
 from stackgen.sampling.alignment import AlignedSampler
 from stackgen.search.sampler import SearchSampler
 from stackgen.search.scale import MOST_BLOCKS, Cells
@@ -38,9 +39,6 @@ BlockList = str | Mapping[str, int] | NDArray[np.int64]
 """`"cube=3,triangle=1"`, `{"cube": 3, "triangle": 1}` or counts (S,) in catalogue order."""
 
 _LISTS_TRIED = 5  # block lists that verified sampling tries, at most
-
-DEFAULT = "default"
-"""Name of the weights in the package."""
 
 
 class Model:

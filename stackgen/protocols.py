@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,10 +35,6 @@ class Verdict:
     settled: Stack
     at_rest: bool = True
     margin: float | None = None
-
-
-CheckerName = Literal["simulator", "statics"]
-"""The checkers that can be asked for by name."""
 
 
 class PhysicsNumbers(Protocol):

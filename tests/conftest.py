@@ -104,7 +104,7 @@ class ThreeCubes:
 def towers(monkeypatch: pytest.MonkeyPatch) -> Model:
     """A model that needs no weights; `stackgen sample` uses it while the test runs."""
     model = Model(TowerSampler(), ThreeCubes())
-    monkeypatch.setattr("stackgen.commands.sample.load", lambda *names: model)
+    monkeypatch.setattr("stackgen.api.load", lambda *names: model)
     return model
 
 

@@ -239,7 +239,7 @@ def test_the_block_list_comes_from_the_inventory(four: Model) -> None:
 def test_the_command_line_verifies_and_answers_by_its_exit_code(
     cli: Cli, four: Model, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("stackgen.commands.sample.load", lambda *names: four)
+    monkeypatch.setattr("stackgen.api.load", lambda *names: four)
     Image.fromarray(FOUR).save(tmp_path / "four.png")
     options = tmp_path / "four.png", "--num_samples", 2, "--out", tmp_path / "out"
     answer = cli("sample", "--blocks", "cube=4", "--verify", "--budget", "30s", *options)

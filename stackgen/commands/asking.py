@@ -12,13 +12,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from stackgen.api import DEFAULT
 from stackgen.commands.parsing import CONFIG_FLAGS, option_values, own_sections
 from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.errors import StackgenError
 from stackgen.evaluation.protocol import BATCH, Scene, load_scenes
 from stackgen.evaluation.requests import Loaded, Method, load_method, require_one_world
 from stackgen.io.text import parse_yaml, read_text, to_yaml
+from stackgen.names import DEFAULT
 from stackgen.training.runs import describe_run, new_run
 
 _OLD_MODEL = "WeightsUnderTest"

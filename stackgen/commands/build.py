@@ -14,13 +14,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from stackgen.api import DEFAULT
 from stackgen.commands.parsing import Command, Files
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.commands.real_arm import RealArm, build_for_real, check_options, write_sheet
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_json
 from stackgen.io.stacks_file import StackEntry, StacksFile, read_stacks, write_stacks
+from stackgen.names import DEFAULT
 from stackgen.robot.planning.build_order import Strategy
 from stackgen.robot.planning.kinematics import SolverName
 from stackgen.robot.workcell import Grasp, Workcell

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import yaml
 from jsonargparse import (
@@ -20,31 +22,59 @@ from jsonargparse import (
     set_loader,
     set_parsing_settings,
 )
-from jsonargparse._optionals import get_omegaconf_loader
 from jsonargparse.typing import register_type
-from omegaconf.errors import OmegaConfBaseException
 
 from stackgen.commands.hints import did_you_mean
 from stackgen.commands.old_names import renew
 from stackgen.errors import StackgenError
 from stackgen.io.text import parse_yaml, read_text, to_yaml
-from stackgen.world import Catalogue
+
+if TYPE_CHECKING:
+    from stackgen.world import Catalogue
+
+Mode = Literal["yaml", "omegaconf+"]
+"""How configuration files are read: with `omegaconf+`, `${...}` stands for another option's value."""
 
 
 def _catalogue(value: Any) -> Catalogue:
     """Make a catalogue from what stands in YAML, or from what jsonargparse makes of a default."""
+    from stackgen.world import Catalogue
+
     if isinstance(value, Mapping) and "init_args" in value:
         return Catalogue(value["init_args"]["shapes"])
     return Catalogue.from_config(value)
 
 
-# In YAML a catalogue is a list of shapes, and no group of options.
-register_type(Catalogue, Catalogue.to_json, _catalogue)
-set_parsing_settings(subclasses_enabled=[Catalogue])
-# What is saved is read back as it was, and no text of a user's is a bug.
-set_dumper("yaml", to_yaml)
-for _mode, _loader in {"yaml": get_loader("yaml"), "omegaconf+": get_omegaconf_loader("omegaconf+")}.items():
-    set_loader(_mode, _loader, (yaml.YAMLError, ValueError, RecursionError))
+@cache
+def _read_files_as(mode: Mode) -> Mode:
+    """Teach jsonargparse to read configuration files; OmegaConf is imported only where it is asked for."""
+    # What is saved is read back as it was, and no text of a user's is a bug.
+    set_dumper("yaml", to_yaml)
+    loader = get_loader("yaml")
+    if mode == "omegaconf+":
+        from jsonargparse._optionals import get_omegaconf_loader
+
+        loader = get_omegaconf_loader(mode)
+    set_loader(mode, loader, (yaml.YAMLError, ValueError, RecursionError))
+    return mode
+
+
+@cache
+def _know_catalogues() -> None:
+    """Teach jsonargparse catalogues: in YAML a list of shapes, and no group of options."""
+    from stackgen.world import Catalogue
+
+    register_type(Catalogue, Catalogue.to_json, _catalogue)
+    set_parsing_settings(subclasses_enabled=[Catalogue])
+
+
+def parser_options(mode: Mode) -> dict[str, Any]:
+    """Give what all our parsers have in common; they raise their errors instead of printing them."""
+    if "stackgen.world" in sys.modules:  # else nobody can have an option that is a catalogue
+        _know_catalogues()
+    common = {"formatter_class": HelpFormatter, "exit_on_error": False, "allow_abbrev": False}
+    return {**common, "parser_mode": _read_files_as(mode)}
+
 
 CONFIG_FLAGS = ("-c", "--config")
 HELP_OF_ALL = "--help=all"
@@ -115,16 +145,13 @@ class Command:
     interpolation: bool = True
     config: str | None = None
 
-    def parser(self) -> ArgumentParser:
-        """Make the parser; it raises its errors instead of printing them."""
+    def parser(self, mode: Mode | None = None) -> ArgumentParser:
+        """Make the parser; files are read as the verb has it, unless another mode is given."""
         parser = ArgumentParser(
+            **parser_options(mode or ("omegaconf+" if self.interpolation else "yaml")),
             prog=f"stackgen {self.verb}",
             description=(self.function.__doc__ or "").partition("\n\n")[0].strip(),
             epilog=epilog(self.example),
-            formatter_class=HelpFormatter,
-            exit_on_error=False,
-            allow_abbrev=False,
-            parser_mode="omegaconf+" if self.interpolation else "yaml",
         )
         parser.add_argument(*CONFIG_FLAGS, action="config", help=CONFIG_HELP)
         if self.files:
@@ -154,11 +181,12 @@ class Command:
 
     def run(self, argv: Sequence[str]) -> int | None:
         """Parse what follows the verb and call the function."""
-        parser = self.parser()
         if HELP_OF_ALL in argv:
-            parser.print_help()
+            self.parser().print_help()
             return 0
-        if {"-h", "--help"} & set(argv):
+        asks_help = {"-h", "--help"} & set(argv)
+        parser = self.parser("yaml" if asks_help else None)
+        if asks_help:
             self._shorten_help(parser)
         values = parse(parser, self.verb, own_sections(self.verb, argv))
         values.pop("config", None)
@@ -213,11 +241,20 @@ def parse(parser: ArgumentParser, verb: str, argv: Sequence[str], own: ArgumentP
     """
     try:
         return parser.parse_args(list(argv))
-    except (ArgumentError, OmegaConfBaseException) as error:
+    except SystemExit:  # after a help; nobody is to wait for the other kinds of errors
+        raise
+    except _refusals() as error:
         text = str(error).replace(f"required: {verb}.", "required: ")
         raise StackgenError(
             f"{_shorten(text)}{did_you_mean(own or parser, text)}; see `stackgen {verb} --help`"
         ) from error
+
+
+def _refusals() -> tuple[type[Exception], ...]:
+    """Give the errors by which parsing refuses what was typed; asked for when there is one."""
+    from omegaconf.errors import OmegaConfBaseException
+
+    return ArgumentError, OmegaConfBaseException
 
 
 def own_sections(verb: str, argv: Sequence[str]) -> list[str]:

@@ -18,14 +18,15 @@ from importlib.util import resolve_name
 from pathlib import Path
 from typing import Any
 
-from stackgen.api import DEFAULT, Model, load
+from stackgen.api import Model, load
 from stackgen.baselines.heuristic import Heuristic
 from stackgen.errors import StackgenError
 from stackgen.evaluation.protocol import BATCH, Request
 from stackgen.evaluation.results import Question
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.models.weights import resolve
-from stackgen.protocols import CheckerName, StackSampler
+from stackgen.names import DEFAULT, CheckerName
+from stackgen.protocols import StackSampler
 from stackgen.sampling.verified import Budget, VerifiedSampler, checker_named
 from stackgen.search.sampler import SearchMethod
 from stackgen.world import World

@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
-from stackgen.protocols import CheckerName, StabilityChecker, StackSampler, Verdict
+from stackgen.names import CheckerName
+from stackgen.protocols import StabilityChecker, StackSampler, Verdict
 from stackgen.sampling.feasible import VALID_IOU
 from stackgen.stack import Layout, Stack, layout
 from stackgen.world import Grid, Mask, World

@@ -16,21 +16,19 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import count
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
+from stackgen.names import Preference
 from stackgen.search.balance import LOOSE, Balance, steadied
 from stackgen.search.rows import NEVER, Levels, Placed, Row, pack
 from stackgen.stack import Layout, Stack, check_block_list, layout
 from stackgen.world import Mask, World
 
 Ints = NDArray[np.int64]
-Preference = Literal["fit", "margin"]
-"""What is best: the stack that fits best, or, of those that fit nearly as well, the one that stands most firmly."""
 
 
 @dataclass(frozen=True)
