@@ -16,7 +16,9 @@ PACKAGE = ROOT / "stackgen"
 RUNS_WITHOUT = {
     "import stackgen": ("numpy", "torch", "scipy"),
     "from stackgen.commands.cli import usage; usage()": ("numpy", "torch", "jsonargparse", "rich"),
-    "import stackgen.commands.sample, stackgen.models.weights": (
+    "from contextlib import redirect_stdout as to; from io import StringIO; from stackgen.commands.cli import main\n"
+    "with to(StringIO()): assert main(['sample', '--help']) == 0": ("numpy", "omegaconf", "rich", "stackgen.api"),
+    "import stackgen.commands.sample_pictures, stackgen.models.weights": (
         "lightning",
         "pytorch_lightning",
         "webdataset",
