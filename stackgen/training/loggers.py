@@ -13,36 +13,70 @@ from typing import Any, Literal
 import yaml
 
 from stackgen._lightning import pl
-from stackgen.errors import require
-from stackgen.training.runs import is_first_process
+from stackgen.errors import require, warn
 from stackgen.viz.render import Picture, save_image
 
 Dashboard = Literal["wandb", "wandb-offline", "tensorboard", "none"]
 
 
-def loggers(folder: Path, dashboard: Dashboard) -> list[pl.loggers.Logger]:
+SECONDS = 20.0
+"""How long wandb's server may take to answer before the curves stay here [s]."""
+
+
+def require_dashboard(dashboard: Dashboard) -> None:
+    """See that a dashboard is installed.
+
+    Raises:
+        StackgenError: If it is not; the line names the extra.
+    """
+    if dashboard == "tensorboard":
+        require("tensorboard", "tensorboard")
+
+
+def loggers(folder: Path, dashboard: Dashboard, first: bool = True) -> list[pl.loggers.Logger]:
     """Make the loggers of a run: CSV, and what was asked for.
 
     Args:
         folder: Folder of the run.
-        dashboard: Where its curves go besides; wandb is offline without `WANDB_API_KEY`.
+        dashboard: Where its curves go besides; wandb is offline without `WANDB_API_KEY`, and where its server refuses
+            the key or does not answer.
+        first: Whether this is the first process of the run.
 
     Raises:
         StackgenError: If TensorBoard is asked for and not installed.
     """
+    require_dashboard(dashboard)
     csv = pl.loggers.CSVLogger(folder.parent.parent, folder.parent.name, folder.name)
     if dashboard == "none":
         return [csv]
-    if is_first_process():
+    if first:
         _ = csv.experiment  # before others put files into its folder
     if dashboard == "tensorboard":
-        require("tensorboard", "tensorboard")
         return [csv, pl.loggers.TensorBoardLogger(folder, "", "", default_hp_metric=False)]
-    offline = dashboard == "wandb-offline" or not os.environ.get("WANDB_API_KEY")
-    name = f"{folder.parent.name}-{folder.name}"
-    wandb = pl.loggers.WandbLogger(name, folder, project="stackgen", offline=offline)
-    getattr(wandb, "_wandb_init", {}).pop("anonymous", None)  # wandb warns about it, whatever its value
-    return [csv, wandb]
+    if dashboard == "wandb-offline" or not os.environ.get("WANDB_API_KEY"):
+        return [csv, _wandb(folder, offline=True)]
+    online = _wandb(folder, offline=False)
+    if not first:
+        return [csv, online]
+    from wandb.errors import Error
+
+    try:
+        _ = online.experiment  # asks the server
+    except Error as error:
+        reason = " ".join(str(error).split()).partition(" Consider ")[0]
+        warn(f"wandb: {reason:.200}; the curves stay in {folder}, from where `wandb sync` uploads them")
+        return [csv, _wandb(folder, offline=True)]
+    return [csv, online]
+
+
+def _wandb(folder: Path, offline: bool) -> pl.loggers.WandbLogger:
+    import wandb
+
+    name, settings = f"{folder.parent.name}-{folder.name}", wandb.Settings(init_timeout=SECONDS)
+    mode: dict[str, Any] = {"mode": "offline"} if offline else {}
+    logger = pl.loggers.WandbLogger(name, folder, project="stackgen", offline=offline, settings=settings, **mode)
+    getattr(logger, "_wandb_init", {}).pop("anonymous", None)  # wandb warns about it, whatever its value
+    return logger
 
 
 class CheckpointArtifact(pl.Callback):
