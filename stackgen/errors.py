@@ -14,6 +14,10 @@ class StackgenError(Exception):
     """
 
 
+class Terminated(KeyboardInterrupt):
+    """The system asked this process to end (SIGTERM); whatever answers Ctrl-C answers it, too."""
+
+
 def warn(line: str) -> None:
     """One line on stderr, each time; Python's own form of a warning has two, and shows the same one once."""
     warnings.warn_explicit(line, UserWarning, "stackgen", 0)

@@ -5,16 +5,22 @@ Standard library only, so that `stackgen --help` answers at once; a verb's modul
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import errno
 import importlib
+import io
 import os
+import signal
 import sys
+import threading
 import traceback
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple, TextIO
 
-BAD_INPUT, BUG, INTERRUPTED = 2, 70, 130
+from stackgen.errors import Terminated
+
+BAD_INPUT, BUG, INTERRUPTED, UNREAD, TERMINATED = 2, 70, 130, 141, 143
 
 
 class Verb(NamedTuple):
@@ -56,10 +62,17 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: Arguments without the program's name; those of the process by default.
 
     Returns:
-        The exit code: 0, what the verb answers (`check`: 1 if a stack falls), 2 for bad input,
-        130 when interrupted, 70 for a bug of ours (with its traceback).
+        The exit code: 0, what the verb answers (`check`: 1 if a stack falls), 2 for bad input, 130 when interrupted,
+        143 when terminated, 141 when nobody reads the output, 70 for a bug of ours (with its traceback).
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    with _standard_streams(), _sigterm_as_an_exception():
+        try:
+            return _run(list(sys.argv[1:] if argv is None else argv))
+        except BrokenPipeError:
+            return _unread()
+
+
+def _run(arguments: list[str]) -> int:
     if arguments[:1] == ["help"] and len(arguments) > 1:
         arguments = [*arguments[1:], "--help"]
     verb, *rest = arguments or ["--help"]
@@ -74,13 +87,15 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _complain("", _unknown(verb), BAD_INPUT)
         return _flushed(importlib.import_module(VERBS[verb].module).run(verb, rest))
     except SystemExit as exit_:  # argparse's --help and the like
+        if _within(exit_, BrokenPipeError):  # rich says 1
+            return _unread()
         return exit_.code if isinstance(exit_.code, int) else 0 if exit_.code is None else BAD_INPUT
     except KeyboardInterrupt as interrupt:
         _debug()
-        return _complain(verb, f"interrupted; {interrupt or 'no half-written file is left behind'}", INTERRUPTED)
+        word, code = ("terminated", TERMINATED) if _within(interrupt, Terminated) else ("interrupted", INTERRUPTED)
+        return _complain(verb, f"{word}; {str(interrupt) or 'no half-written file is left behind'}", code)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python complains once more at exit
-        return 0
+        raise
     except Exception as error:  # noqa: BLE001 - the one place that turns errors into lines
         line = explain(error)
         if line is None:
@@ -90,12 +105,61 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(verb, line, BAD_INPUT)
 
 
+def _within(error: BaseException | None, kind: type[BaseException]) -> bool:
+    """Tell whether an error is of a kind, or was raised while one of that kind was answered."""
+    while error is not None and not isinstance(error, kind):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+@contextlib.contextmanager
+def _standard_streams() -> Iterator[None]:
+    """Give a process whose output was closed one that goes nowhere; letters that a terminal lacks come out escaped."""
+    before = sys.stdout, sys.stderr
+    for name, stream in zip(("stdout", "stderr"), before, strict=True):
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - for the rest of the process
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    yield
+
+
+@contextlib.contextmanager
+def _sigterm_as_an_exception() -> Iterator[None]:
+    """Answer SIGTERM as Ctrl-C is answered: nothing is left half done."""
+
+    def terminate(number: int, frame: object) -> None:
+        raise Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _unread() -> int:
+    """End as others do whose reader has gone."""
+    _abandon(sys.stdout)
+    return UNREAD
+
+
+def _abandon(stream: TextIO) -> None:
+    """Lead a stream nowhere that cannot be written to: else Python complains once more at exit."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+
+
 def explain(error: BaseException) -> str | None:
     """Put an error that a user can mend in one line; None for a bug."""
     kinds = {kind.__name__ for kind in type(error).__mro__}
     text = " ".join(str(error).split())
     if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-        return f"disk full while writing {error.filename or 'a file'}: free some space and run the command again"
+        what = error.filename or "a file or the output"
+        return f"disk full while writing {what}: free some space and run the command again"
     if isinstance(error, OSError) and error.errno is not None:
         return f"{error.strerror or text}: {error.filename}" if error.filename else text
     if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("stackgen"):
@@ -140,13 +204,26 @@ def _version() -> str:
 
 
 def _flushed(code: int | None) -> int:
-    """Flush here, where a broken pipe is still caught."""
-    sys.stdout.flush()
+    """Flush here, where what goes wrong is still caught."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        _abandon(sys.stdout)
+        return _complain("", f"the output cannot be written: {error.strerror}", BAD_INPUT)
     return code or 0
 
 
 def _complain(verb: str, message: str, code: int) -> int:
-    print(f"stackgen{' ' if verb else ''}{verb}: {message.removeprefix(f'{verb}: ')}", file=sys.stderr)
+    """Say what is wrong in one line; what is written to a terminal cannot move its cursor."""
+    line = f"stackgen{' ' if verb else ''}{verb}: {message.removeprefix(f'{verb}: ')}"
+    with contextlib.suppress(OSError):
+        print("".join(c if c.isprintable() else ascii(c)[1:-1] for c in line), file=sys.stderr)
+    with contextlib.suppress(OSError):
+        sys.stdout.flush()
+        return code
+    _abandon(sys.stdout)
     return code
 
 

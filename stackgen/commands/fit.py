@@ -15,27 +15,29 @@ from typing import Any
 os.environ.setdefault("JSONARGPARSE_DEPRECATION_WARNINGS", "off")  # Lightning 2.6 calls what jsonargparse 5 drops
 os.environ.setdefault("WANDB_SILENT", "true")
 
-import torch
 from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.cli import ArgsType, LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.plugins.environments import LightningEnvironment
+from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from stackgen.commands.found_config import described, taken_from
 from stackgen.commands.old_names import renew
-from stackgen.commands.parsing import CONFIG_FLAGS, HelpFormatter, epilog, option_values, own_sections, parse
+from stackgen.commands.parsing import CONFIG_FLAGS, epilog, option_values, own_sections, parse, parser_options
 from stackgen.data.datamodule import StackDataModule
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_json
 from stackgen.io.text import parse_yaml, read_text, to_yaml
-from stackgen.models.weights import CHECKPOINT_KEY, last_checkpoint
+from stackgen.models.weights import CHECKPOINT_KEY, last_checkpoint, load_checkpoint
 from stackgen.protocols import StabilityChecker
 from stackgen.sim.other_physics import warn_of_other_physics
 from stackgen.sim.physics import Physics
 from stackgen.training.callbacks import SampleQuality, StepMetrics, Throughput
+from stackgen.training.checkpoints import KeepOnStop, keep_whole
 from stackgen.training.divergence import StopIfDiverged
-from stackgen.training.loggers import CheckpointArtifact, Dashboard, log_configuration, loggers
-from stackgen.training.runs import RUNS, config_of, describe_run, is_first_process, new_shared_run
+from stackgen.training.loggers import CheckpointArtifact, Dashboard, log_configuration, loggers, require_dashboard
+from stackgen.training.runs import RUNS, config_of, describe_run, drop_run_without, is_first_process, new_shared_run
 from stackgen.training.sweeps.telling import TellSweep, in_a_sweep
 
 EXAMPLES = {
@@ -52,8 +54,8 @@ CHECKPOINTS = {
     "fit": "Checkpoint to resume from: a file, the folder of a run, or `last` for the newest of the runs of this name."
     " Without --config, the configuration beside it is used, as far as it names nothing but stackgen's own classes and"
     " local data.",
-    "validate": "Checkpoint to validate: a file, or the folder of a run. Without --config, the configuration beside it is"
-    " used, as far as it names nothing but stackgen's own classes and local data.",
+    "validate": "Checkpoint to validate: a file, or the folder of a run. Without --config, the configuration beside it"
+    " is used, as far as it names nothing but stackgen's own classes and local data.",
 }
 
 
@@ -66,12 +68,13 @@ def run(verb: str, argv: Sequence[str]) -> None:
         logging.getLogger(chatty).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", ".*treespec, LeafSpec.*", FutureWarning)  # Lightning calls what PyTorch renames
     interrupt = signal.getsignal(signal.SIGINT)
+    StackgenCLI.made = None
     try:
         _command_line(StackgenCLI, [verb, *own_sections(verb, argv)])
     except SystemExit as stop:  # Lightning answers Ctrl-C by exit(1)
         if not isinstance(stop.__context__, KeyboardInterrupt):
             raise
-        raise KeyboardInterrupt("go on with --ckpt_path last" if verb == "fit" else "") from None
+        raise KeyboardInterrupt(_how_to_go_on(StackgenCLI.made) if verb == "fit" else "") from None
     except RuntimeError as error:
         if "loading state_dict" not in str(error):
             raise
@@ -80,6 +83,14 @@ def run(verb: str, argv: Sequence[str]) -> None:
         ) from error
     finally:
         signal.signal(signal.SIGINT, interrupt)  # Lightning leaves it ignored
+        if StackgenCLI.made and sys.exc_info()[0] is not None:
+            drop_run_without("checkpoints/*.ckpt" if verb == "fit" else "metrics.json", StackgenCLI.made)
+
+
+def _how_to_go_on(folder: Path | None) -> str:
+    """Say how a training continues that was stopped."""
+    last = folder / "checkpoints" / "last.ckpt" if folder else None
+    return f"the state is kept: go on with --ckpt_path {last}" if last and last.is_file() else "nothing is kept yet"
 
 
 def parser_of(verb: str) -> ArgumentParser:
@@ -98,12 +109,7 @@ def parser_of(verb: str) -> ArgumentParser:
 
 def _command_line(kind: type[StackgenCLI], arguments: list[str]) -> None:
     """Parse, build and run."""
-    common = {
-        "exit_on_error": False,
-        "parser_mode": "omegaconf+",
-        "allow_abbrev": False,
-        "formatter_class": HelpFormatter,
-    }
+    common = parser_options("omegaconf+")
     verbs = {
         verb: {**common, "description": DESCRIPTIONS[verb], "epilog": epilog(example)}
         for verb, example in EXAMPLES.items()
@@ -123,6 +129,9 @@ def _command_line(kind: type[StackgenCLI], arguments: list[str]) -> None:
 
 class StackgenCLI(LightningCLI):
     """Lightning's command line with run folders, `--ckpt_path last` and errors of one line."""
+
+    made: Path | None = None
+    """Folder of the run that this process has made."""
 
     @staticmethod
     def subcommands() -> dict[str, set[str]]:
@@ -169,27 +178,48 @@ class StackgenCLI(LightningCLI):
             _check_checkpoint(Path(config.ckpt_path))
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """Make the run's folder, once model and data are there; keep logs and checkpoints in it."""
+        """Make the trainer, which knows what process this is, then the run's folder for its logs and checkpoints."""
         verb, config = str(self.subcommand), self._get(self.config_init, "trainer")
         given: list[Callback] = [config.callbacks] if isinstance(config.callbacks, Callback) else config.callbacks or []
         self.folder: Path | None = None
-        if not config.fast_dev_run:
-            made = self.datamodule.manifest.physics  # a mistake in the path must not leave an empty run behind
-            if is_first_process():
-                warn_of_other_physics(f"dataset {self.datamodule.path}", made, Physics.recorded(made).to_json())
-            kind = "version" if verb == "fit" else verb
-            self.folder = new_shared_run(self._get(self.config, "name"), Path(config.default_root_dir), kind)
-            self.save_config_kwargs = {"folder": self.folder}
-            if config.logger in (None, True):
-                curves = verb == "fit" and not in_a_sweep()  # a trial is watched by its sweep alone
-                kwargs["logger"] = loggers(self.folder, self._get(self.config, "dashboard") if curves else "none")
-            if verb == "fit":
-                keeps = config.enable_checkpointing is not False
-                kwargs["callbacks"] = _complete(given, self.folder / "checkpoints" if keeps else None)
+        curves = verb == "fit" and not in_a_sweep()  # a trial is watched by its sweep alone
+        dashboard: Dashboard = self._get(self.config, "dashboard") if curves else "none"
+        own_loggers = not config.fast_dev_run and config.logger in (None, True)
+        if own_loggers:
+            require_dashboard(dashboard)
+            kwargs["logger"] = False  # until there is a folder
+        if verb == "fit" and not config.fast_dev_run:
+            kwargs["callbacks"] = _complete(given, keep=config.enable_checkpointing is not False)
+        if _tasks_are_runs():
+            plugins = config.plugins if isinstance(config.plugins, list) else [config.plugins]
+            kwargs["plugins"] = [*filter(None, plugins), LightningEnvironment()]
         for callback in given:
             if isinstance(callback, SampleQuality) and callback.checker is None:
                 callback.checker = _simulator(self.datamodule)
-        return super().instantiate_trainer(**kwargs)
+        made = self.datamodule.manifest.physics  # a mistake in the path must not leave an empty run behind
+        trainer = super().instantiate_trainer(**kwargs)
+        keep_whole(trainer)
+        # What launchers left in the environment says nothing of this run.
+        rank_zero_only.rank = trainer.global_rank  # type: ignore[attr-defined]
+        if not config.fast_dev_run:
+            if trainer.is_global_zero:
+                warn_of_other_physics(f"dataset {self.datamodule.path}", made, Physics.recorded(made).to_json())
+            self.folder = self._open_folder(trainer, "version" if verb == "fit" else verb)
+            if own_loggers:
+                trainer.loggers = loggers(self.folder, dashboard, trainer.is_global_zero)
+        return trainer
+
+    def _open_folder(self, trainer: Trainer, kind: str) -> Path:
+        """Make the run's folder, and tell it those who write into it."""
+        name, runs = self._get(self.config, "name"), Path(trainer.default_root_dir)
+        folder = new_shared_run(name, runs, kind, trainer.is_global_zero)
+        StackgenCLI.made = folder if trainer.is_global_zero else None
+        for callback in trainer.callbacks:  # type: ignore[attr-defined]
+            if isinstance(callback, SaveRun):
+                callback.folder = folder
+            elif isinstance(callback, OwnCheckpoints):
+                callback.dirpath = str(folder / "checkpoints")
+        return folder
 
     def after_validate(self) -> None:
         """Leave the metrics behind."""
@@ -200,18 +230,24 @@ class StackgenCLI(LightningCLI):
         print(f"wrote {path}")
 
 
+def _tasks_are_runs() -> bool:
+    """Tell whether Slurm's tasks are runs of their own: those of one run are started with --ntasks-per-node."""
+    return os.environ.get("SLURM_NTASKS", "1") != "1" and "SLURM_NTASKS_PER_NODE" not in os.environ
+
+
 class SaveRun(SaveConfigCallback):
     """Writes down what made a run, also for its dashboards: its configuration; code, data and command in `run.json`.
 
     Args:
         parser: Parser of the verb.
         config: What it made of the command line.
-        folder: Folder of the run, whatever its loggers are.
     """
 
-    def __init__(self, parser: LightningArgumentParser, config: Namespace, folder: Path) -> None:
+    folder: Path
+    """Folder of the run, whatever its loggers are; set once it is there."""
+
+    def __init__(self, parser: LightningArgumentParser, config: Namespace) -> None:
         super().__init__(parser, config, save_to_log_dir=False)
-        self.folder = folder
 
     def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Write, on the first process, once the folder is there."""
@@ -245,31 +281,29 @@ def _checkpoint_of(value: str) -> Path:
 
 def _check_checkpoint(path: Path) -> None:
     """Say in one line if a file is no checkpoint of a training; only tensors and plain values are read from it."""
-    if not path.is_file():
-        raise StackgenError(f"no checkpoint at {path}")
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except Exception as error:
-        raise StackgenError(f"{path} is not a checkpoint of `stackgen fit`: {type(error).__name__}") from error
-    if not isinstance(content, dict) or CHECKPOINT_KEY not in content:
+    if CHECKPOINT_KEY not in load_checkpoint(path):
         raise StackgenError(f"{path} is not a checkpoint of `stackgen fit`: it says nothing of its world")
 
 
-def _complete(callbacks: list[Callback], checkpoints: Path | None) -> list[Callback]:
+class OwnCheckpoints(ModelCheckpoint):
+    """Keeps the last state in the folder of the run."""
+
+
+def _complete(callbacks: list[Callback], keep: bool) -> list[Callback]:
     """Add the callbacks that a dashboard lives on, or a sweep, and one that keeps the last state if none keeps any.
 
     Args:
         callbacks: Those of the configuration.
-        checkpoints: Folder to keep states in; None keeps none.
+        keep: Whether any state is kept.
     """
     found = list(callbacks)
-    for kind in (StepMetrics, Throughput, CheckpointArtifact, StopIfDiverged):
+    for kind in (StepMetrics, Throughput, CheckpointArtifact, StopIfDiverged, KeepOnStop):
         if not any(isinstance(callback, kind) for callback in found):
             found.append(kind())
     if in_a_sweep():
         found.append(TellSweep())
-    if checkpoints and not any(isinstance(callback, ModelCheckpoint) for callback in found):
-        found.append(ModelCheckpoint(checkpoints, save_last=True, save_on_exception=True))
+    if keep and not any(isinstance(callback, ModelCheckpoint) for callback in found):
+        found.append(OwnCheckpoints(save_last=True, save_on_exception=True))
     return found
 
 

@@ -48,8 +48,9 @@ def taken_from(content: Any, path: Path, typed: Collection[str], sections: Colle
         reason = _foreign(place, value, path)
         if reason:
             raise StackgenError(
-                f"{path} was found beside the checkpoint, and its {'.'.join(place)} {reason}, {printable(value)[:80]!r}:"
-                f" add --config {path} if you trust it, or type another --{'.'.join(map(str, place[:2]))}"
+                f"{path} was found beside the checkpoint, and its {'.'.join(map(str, place))} {reason},"
+                f" '{printable(value)[:80]}': add --config {path} if you trust it, or type another"
+                f" --{'.'.join(map(str, place[:2]))}"
             )
     return taken
 
@@ -65,9 +66,8 @@ def _without(value: Any, typed: Collection[str], name: str) -> Any:
     """Leave out what was typed."""
     if not isinstance(value, dict):
         return value
-    return {
-        key: _without(inner, typed, f"{name}.{key}") for key, inner in value.items() if f"{name}.{key}" not in typed
-    }
+    named = {f"{name}.{key}": (key, inner) for key, inner in value.items()}
+    return {key: _without(inner, typed, full) for full, (key, inner) in named.items() if full not in typed}
 
 
 def _leaves(value: Any, place: tuple[Any, ...] = ()) -> Iterator[tuple[tuple[Any, ...], Any]]:

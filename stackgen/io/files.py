@@ -15,7 +15,7 @@ from typing import Any
 from stackgen.errors import StackgenError
 
 
-def write_atomically(path: str | Path, data: bytes) -> None:
+def write_atomically(path: str | Path, data: bytes | memoryview) -> None:
     """Write a file whole or not at all: under a temporary name in its folder, made if missing, then in its place.
 
     Raises:
@@ -31,12 +31,23 @@ def write_atomically(path: str | Path, data: bytes) -> None:
                 file.flush()
                 os.fsync(file.fileno())
             os.replace(temporary, path)
+            _flush_folder(path.parent)
         except BaseException:  # Ctrl-C too
             with contextlib.suppress(OSError):
                 temporary.unlink()
             raise
     except OSError as error:
         raise StackgenError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _flush_folder(folder: Path) -> None:
+    """Have the new name survive a power cut, where the file system knows how."""
+    with contextlib.suppress(OSError):
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
 
 
 def write_json(path: str | Path, content: Any, indent: int | None = 1) -> None:

@@ -98,15 +98,22 @@ def resolve(weights: str | Path, role: str = "sampler", other_names: Sequence[st
 
 
 def last_checkpoint(folder: Path) -> Path:
-    """Find the newest `last.ckpt` of a run (all its versions) or of one version.
+    """Find the `last.ckpt` of a run, that of its highest version, or of one version.
 
     Raises:
         StackgenError: If there is none.
     """
-    found = [*folder.glob("checkpoints/last.ckpt"), *folder.glob("version_*/checkpoints/last.ckpt")]
+    found = _last_checkpoints(folder)
     if not found:
         raise StackgenError(f"no checkpoint in {folder}: there is no version_*/checkpoints/last.ckpt in it")
-    return max(found, key=lambda path: path.stat().st_mtime)
+    return found[0]
+
+
+def _last_checkpoints(folder: Path) -> list[Path]:
+    """List the `last.ckpt` of a run's versions, the highest first, or that of one version."""
+    versions = [path for path in folder.glob("version_*") if path.name.removeprefix("version_").isdecimal()]
+    versions.sort(key=lambda path: int(path.name.removeprefix("version_")), reverse=True)
+    return [path for part in (folder, *versions) if (path := part / "checkpoints" / "last.ckpt").is_file()]
 
 
 def write_weights(path: Path, tensors: dict[str, Tensor], card: dict[str, Any]) -> None:
@@ -142,17 +149,48 @@ def export_checkpoint(
     return card
 
 
-def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def load_checkpoint(path: Path) -> dict[str, Any]:
+    """Read a checkpoint of a training: tensors and plain values, and nothing else is unpickled.
+
+    Raises:
+        StackgenError: If it is none or is damaged; the line names an older one that is whole, if there is one.
+    """
     try:
-        with zipfile.ZipFile(path) as archive:  # torch checks no checksums
-            if archive.testzip() is not None:
-                raise zipfile.BadZipFile
+        if not _is_whole(path):
+            raise zipfile.BadZipFile
         checkpoint = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError as error:
+        raise StackgenError(f"no checkpoint at {path}") from error
     except OSError as error:
         raise StackgenError(f"{path} cannot be read: {error.strerror or error}") from error
     except _DAMAGED as error:
-        raise StackgenError(f"{path} is not a checkpoint of stackgen, or is damaged") from error
-    parts = checkpoint if isinstance(checkpoint, dict) else {}
+        older = next(filter(_is_whole, _older(path)), None)
+        offer = f"; {older} is older and whole" if older else ""
+        raise StackgenError(f"{path} is not a checkpoint of stackgen, or is damaged{offer}") from error
+    return checkpoint if isinstance(checkpoint, dict) else {}
+
+
+def _is_whole(path: Path) -> bool:
+    """Compare the checksums of a checkpoint, which torch does not."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.testzip() is None
+    except _DAMAGED:
+        return False
+
+
+def _older(path: Path) -> list[Path]:
+    """List what may be older checkpoints of the same run: those beside it, then the last of other versions."""
+    beside = sorted(path.parent.glob("*.ckpt"), key=lambda other: other.stat().st_mtime, reverse=True)
+    return [
+        other
+        for other in [*beside, *_last_checkpoints(path.absolute().parent.parent.parent)]
+        if other.resolve() != path.resolve()
+    ]
+
+
+def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    parts = load_checkpoint(path)
     card, state = parts.get(CHECKPOINT_KEY), parts.get("state_dict")
     if not isinstance(card, dict) or not isinstance(state, dict):
         raise StackgenError(f"{path} is a checkpoint, but not one of stackgen's models")

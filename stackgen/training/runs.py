@@ -5,9 +5,12 @@ What the other verbs find out stands beside it: `runs/<name>/test_<n>/{config.ya
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
+import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -50,9 +53,41 @@ def new_run(name: str, root: Path = RUNS, kind: str = "version") -> Path:
             number += 1
 
 
-def new_shared_run(name: str, root: Path, kind: str) -> Path:
-    """Like new_run, in a distributed run: the first process makes the folder, the others are told of it."""
-    if not is_first_process():
+def drop_run_without(worth: str, folder: Path) -> None:
+    """Remove the folder of a run that came to nothing, and the folders above it that are then empty.
+
+    Args:
+        worth: Pattern of the files that are worth keeping; if there is one, the folder stays.
+        folder: Folder of the run.
+    """
+    if any(folder.glob(worth)):
+        return
+    shutil.rmtree(folder, ignore_errors=True)
+    with contextlib.suppress(OSError):  # they hold other runs
+        folder.parent.rmdir()
+        folder.parent.parent.rmdir()
+
+
+@contextlib.contextmanager
+def dropped_if_failing(worth: str, folder: Path) -> Iterator[None]:
+    """See that a block that fails or is stopped leaves no folder without anything that is worth keeping."""
+    try:
+        yield
+    except BaseException:
+        drop_run_without(worth, folder)
+        raise
+
+
+def new_shared_run(name: str, root: Path, kind: str, first: bool) -> Path:
+    """Like new_run, in a distributed run: the first process makes the folder, the others are told of it.
+
+    Args:
+        name: Name of the run.
+        root: Folder of all runs.
+        kind: Beginning of the folder's name.
+        first: Whether this is the first process of the run, as its trainer says.
+    """
+    if not first:
         return Path(os.environ.get(_FOLDER, root / name))  # on another machine they write nothing
     folder = new_run(name, root, kind)
     os.environ[_FOLDER] = str(folder)
@@ -60,8 +95,8 @@ def new_shared_run(name: str, root: Path, kind: str) -> Path:
 
 
 def is_first_process() -> bool:
-    """Tell whether this is the first process of a distributed run, also before Lightning is there to be asked."""
-    return not any(int(os.environ.get(name, 0)) for name in _RANKS)
+    """Guess whether this is the first process of a distributed run, for messages before there is a trainer to ask."""
+    return all(os.environ.get(name, "0") in ("", "0") for name in _RANKS)
 
 
 def describe_run(folder: Path, config: str, dataset: Dataset | None) -> dict[str, Any]:

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -42,14 +45,58 @@ def test_help_lists_every_verb(cli: Cli) -> None:
         assert all(f"  {verb} " in answer.out for verb in VERBS)
 
 
-def test_a_closed_pipe_is_no_error() -> None:
+ARCH = str(Path(__file__).parents[2] / "examples" / "stacks" / "arch.json")
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["check", ARCH]])
+def test_a_reader_that_has_gone_ends_a_command_without_a_word(arguments: list[str]) -> None:
+    """Not with 0 or 1, which are verdicts: nobody has read one."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "stackgen", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=CHILD
+        [sys.executable, "-m", "stackgen", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, env=CHILD
     )
     assert process.stdout is not None
     process.stdout.close()
-    _, err = process.communicate(timeout=20)
-    assert (process.returncode, err) == (0, b"")
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (141, b"")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is always full")
+@pytest.mark.parametrize("arguments", [["--help"], ["check", ARCH]])
+def test_a_full_output_is_one_line(arguments: list[str]) -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "stackgen", *arguments], stdout=full, stderr=subprocess.PIPE, env=CHILD, text=True
+        )
+    assert done.returncode == 2 and len(done.stderr.splitlines()) == 1, done.stderr
+
+
+@pytest.mark.parametrize("redirection", [">&-", "2>&-", ">&- 2>&-"])
+def test_a_closed_output_changes_no_verdict(redirection: str) -> None:
+    command = f"{sys.executable} -m stackgen check {ARCH} {redirection}"
+    assert subprocess.run(["sh", "-c", command], env=CHILD, capture_output=True).returncode == 0
+
+
+def test_no_text_moves_the_cursor_or_is_too_much_for_a_terminal() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "stackgen", "check", "b\u00fccher\x1b[2J\r\n.json"],
+        capture_output=True,
+        env={**CHILD, "PYTHONIOENCODING": "ascii"},
+    )
+    assert done.returncode == 2
+    assert done.stderr == b"stackgen check: b\\xfccher\\x1b[2J .json: no such file\n"
+
+
+def test_sigterm_ends_a_command_with_143(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = signal.getsignal(signal.SIGTERM)
+
+    def killed(argv: object) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(10)
+
+    monkeypatch.setattr("stackgen.commands.check.COMMAND", SimpleNamespace(run=killed))
+    answer = cli("check", ARCH)
+    assert (answer.code, answer.err) == (143, "stackgen check: terminated; no half-written file is left behind\n")
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_sample_leaves_file_picture_and_one_glb_per_stack(

@@ -147,7 +147,7 @@ def test_a_checkpoint_of_another_shape_is_refused_in_one_line(cli: Cli, config: 
     assert "does not fit the model" in answer.err.splitlines()[-1]
 
 
-@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_a_run_that_was_stopped_goes_on(blow: signal.Signals, cli: Cli, config: Path) -> None:
     config.write_text(config.read_text().replace("max_epochs: 2", "max_epochs: 100000"))
     process = subprocess.Popen(
@@ -164,15 +164,26 @@ def test_a_run_that_was_stopped_goes_on(blow: signal.Signals, cli: Cli, config: 
         time.sleep(0.05)
     process.send_signal(blow)
     _, err = process.communicate(timeout=60)
-    if blow is signal.SIGINT:
-        assert process.returncode == 130
-        assert "interrupted; go on with --ckpt_path last" in err.splitlines()[-1]
+    if blow is not signal.SIGKILL:
+        code, word = (130, "interrupted") if blow is signal.SIGINT else (143, "terminated")
+        assert process.returncode == code
+        assert err.splitlines()[-1] == f"stackgen fit: {word}; the state is kept: go on with --ckpt_path {last}"
     done = steps(last)
     assert done >= 3
     epochs = done // 3 + 2
     answer = cli("fit", "--config", config, "--ckpt_path", "last", "--trainer.max_epochs", epochs)
     assert answer.code == 0, answer.err
     assert steps(Path("runs/tiny/version_1/checkpoints/last.ckpt")) == 3 * epochs
+
+
+def test_a_command_that_fails_leaves_no_run_folder(cli: Cli, config: Path) -> None:
+    foreign = ["--trainer.callbacks+=stackgen.training.StartFrom", "--trainer.callbacks.weights", "nowhere.ckpt"]
+    answer = cli("fit", "--config", config, "--dashboard", "none", *foreign)
+    assert answer.code == 2 and "nowhere.ckpt" in answer.err, answer.err
+    assert not Path("runs").exists()
+    assert cli("fit", "--config", config, "--dashboard", "none").code == 0
+    assert cli("fit", "--config", config, "--dashboard", "none", *foreign).code == 2
+    assert [path.name for path in Path("runs/tiny").iterdir()] == ["version_0"]
 
 
 def test_validate_finds_the_configuration_beside_the_checkpoint(cli: Cli, config: Path) -> None:
