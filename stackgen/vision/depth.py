@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.vision.images import Levels, Picture, Raster
+from stackgen.vision.drawings import of_two_tones
+from stackgen.vision.images import Levels, Picture, Raster, as_bytes
 from stackgen.vision.masks import bounding_box, components, largest, smoothed
 from stackgen.world import Mask
 
@@ -200,8 +201,10 @@ def is_frame(raster: Raster) -> bool:
     if not isinstance(raster, Levels) or min(raster.values.shape) < 48:
         return False
     values = raster.values[np.isfinite(raster.values)].astype(np.float64)
-    if not values.size:
-        return True
+    if raster.values.dtype.kind in "ui" and values.max() > 30000 and of_two_tones(as_bytes(raster.values)):
+        return False
+    if len(values) < 0.05 * raster.values.size:
+        return raster.values.size > 100_000
     low, high = np.quantile(values, [0.005, 0.995])
     ends = np.minimum(values - values.min(), values.max() - values) < 0.02 * max(np.ptp(values), 1e-9)
     near = np.minimum(np.abs(values - low), np.abs(values - high)) < 0.03 * max(high - low, 1e-9)

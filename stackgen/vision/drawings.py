@@ -39,6 +39,7 @@ class Drawn:
         scale: Pixels of `ink` for one of the picture as it was read.
         place: (left, top) of `ink` in the picture as it was read [pixel].
         notes: What is doubtful, a sentence each.
+        even: Whether neighbouring pixels are equal nearly everywhere, as in no photo.
     """
 
     ink: Mask
@@ -46,6 +47,20 @@ class Drawn:
     scale: float
     place: tuple[int, int]
     notes: tuple[str, ...]
+    even: bool
+
+    def drawn_on(self, figure: Mask) -> bool:
+        """Tell whether what was found (H, W) is itself drawn on, as a sheet of paper is."""
+        import cv2
+
+        level = (255 * (1 - self.darkness)).astype(np.uint8)
+        inner = cv2.erode(figure.astype(np.uint8), np.ones((25, 25), np.uint8)) > 0
+        if np.count_nonzero(inner) < 0.1 * inner.size:
+            return False
+        lighter = cv2.morphologyEx(level, cv2.MORPH_OPEN, np.ones((21, 21), np.uint8))
+        strokes = inner & (level.astype(np.int16) - lighter > 0.35 * float(self.darkness[inner].max()) * 255)
+        share = np.count_nonzero(strokes) / np.count_nonzero(inner)
+        return bool(0.002 < share < 0.3) and not self.even
 
 
 def find_drawn(image: Image8) -> Drawn:
@@ -60,7 +75,7 @@ def find_drawn(image: Image8) -> Drawn:
     difference = _resized(difference, scale)
     if np.quantile(difference, 0.999) < _CONTRAST:
         raise StackgenError("is all one colour, so nothing or everything is in it; draw a structure on a background")
-    ink = _clean(difference > _threshold(difference))
+    ink = _clean(_without_rim(difference > _threshold(difference)))
     if ink.mean() > 0.98:
         raise StackgenError("the structure fills the whole frame; leave some background around it")
     if not ink.any():
@@ -72,7 +87,7 @@ def find_drawn(image: Image8) -> Drawn:
             f"the structure in it is only {columns / scale * image.factor:.0f} x {rows / scale * image.factor:.0f}"
             f" pixels; at least {SMALLEST} are needed, draw or scan it larger"
         )
-    return Drawn(ink, (difference / 255).astype(np.float32), scale, place, notes)
+    return Drawn(ink, (difference / 255).astype(np.float32), scale, place, notes, is_flat(image))
 
 
 def _levels(image: Image8) -> tuple[Levels, tuple[int, int]]:
@@ -98,25 +113,30 @@ def _levels(image: Image8) -> tuple[Levels, tuple[int, int]]:
 
 
 def _framed(levels: Levels, place: tuple[int, int]) -> tuple[Levels, tuple[int, int]]:
-    """Cut off lines along the picture's edges: thin, of one colour from end to end, unlike what is beside them."""
+    """Cut off lines along the picture's edges: thin, of one colour from end to end, unlike the ground within."""
+    depth = max(2, round(_BORDER * min(levels.shape[:2])))
+    inner = levels[depth:-depth, depth:-depth]
+    if min(inner.shape[:2]) < 4:
+        return levels, place
+    ring = [inner[0], inner[-1], inner[:, 0], inner[:, -1]]
+    ground = np.median(np.concatenate(ring), axis=0)
     top, bottom, left, right = 0, levels.shape[0], 0, levels.shape[1]
     for _ in range(2):  # a border's corners show once a neighbouring side is gone
         part = levels[top:bottom, left:right]
-        widths = [_border(np.rot90(part, turns)) for turns in range(4)]  # of the top, right, bottom and left
+        widths = [_border(np.rot90(part, turns), ground) for turns in range(4)]  # of the top, right, bottom and left
         top, right, bottom, left = top + widths[0], right - widths[1], bottom - widths[2], left + widths[3]
     return levels[top:bottom, left:right], (place[0] + left, place[1] + top)
 
 
-def _border(levels: Levels) -> int:
-    """Return the width of a line along the upper edge [pixel], 0 where there is none."""
-    most = max(2, round(_BORDER * len(levels)))
+def _border(levels: Levels, ground: NDArray[np.floating]) -> int:
+    """Return the width of a line along the upper edge [pixel], 0 where there is none or it is as the ground (C,)."""
+    most = max(1, round(_BORDER * len(levels)))
     if len(levels) < 4 * most:
         return 0
     rows = levels[: 2 * most + 2]
     tones = np.median(rows, axis=1)
-    even = (np.abs(rows - tones[:, None]).max(axis=2) < _CONTRAST).mean(axis=1) > 0.95
-    after = np.median(rows[most:].reshape(-1, rows.shape[2]), axis=0)
-    unlike = np.abs(tones - after).max(axis=1) > _CONTRAST
+    even = (np.abs(rows - tones[:, None]).max(axis=2) < 2 * _CONTRAST).mean(axis=1) > 0.9  # palettes are dithered
+    unlike = np.abs(tones - ground).max(axis=1) > _CONTRAST
     line = even & unlike
     if not line[0] or line.all():
         return 0
@@ -192,10 +212,21 @@ def _otsu(values: Levels) -> float:
     return float((levels[is_low].mean() + levels[~is_low].mean()) / 2) if 0 < is_low.sum() < is_low.size else 0.0
 
 
+def _without_rim(mask: Mask) -> Mask:
+    """Remove thin lines along the mask's edges (H, W), which are not of one colour or not quite straight."""
+    kept = mask.copy()
+    for turns in range(4):
+        side = np.rot90(kept, turns)  # a view: what is removed from it is removed from the mask
+        shares = side[: max(2, round(2 * _BORDER * len(side)))].mean(axis=1)
+        if shares[0] > 0.85 and shares[len(shares) // 2 :].max() < 0.5:
+            side[: int(np.argmax(shares < 0.5)) + 1] = False
+    return kept
+
+
 def _clean(mask: Mask) -> Mask:
     """Remove parts and fill holes that are tiny beside the mask's largest part."""
     labels, areas = components(mask, connectivity=4)
-    limit = _SPECK * areas.max()
+    limit = _SPECK * areas.max(initial=0)
     kept = (areas >= max(limit, 1))[labels]
     holes, sizes = components(~kept, connectivity=4)
     return np.asarray(kept | (sizes < limit)[holes])
@@ -257,11 +288,39 @@ def as_it_is(image: Image8, grid: Grid) -> Mask | None:
     return mask if fits(mask, grid) else None
 
 
+def is_drawing(image: Image8) -> bool:
+    """Tell a drawing from a photo without a sheet in it: its ground is of one colour, or it has two tones only."""
+    return min(image.colours.shape[:2]) < 64 or image.alpha is not None or is_even(image) or is_two_tone(image)
+
+
 def is_flat(image: Image8) -> bool:
     """Tell whether neighbouring pixels are equal nearly everywhere, as a drawing program leaves them and no camera."""
-    grey = image.colours.mean(axis=2)
-    steps = np.abs(np.diff(grey, axis=1))[1:], np.abs(np.diff(grey, axis=0))[:, 1:]
-    return bool(((steps[0] < 0.4) & (steps[1] < 0.4)).mean() > 0.8) and is_even(image)
+    green = image.colours[..., 1]
+    same = (green[1:, 1:] == green[1:, :-1]) & (green[1:, 1:] == green[:-1, 1:])
+    return float(np.count_nonzero(same)) > 0.8 * same.size
+
+
+def is_two_tone(image: Image8) -> bool:
+    """Tell whether a picture has two tones, but for grain and soft edges."""
+    red, green, blue = np.moveaxis(image.colours, 2, 0)
+    return of_two_tones(np.maximum(np.maximum(red, green), blue)) or of_two_tones(
+        np.minimum(np.minimum(red, green), blue)
+    )
+
+
+def of_two_tones(values: NDArray[np.uint8]) -> bool:
+    """Tell whether levels (H, W) lie near to two of them, far apart."""
+    import cv2
+
+    split, _ = cv2.threshold(values, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    low, high = values[values <= split], values[values > split]
+    if not low.size or not high.size:
+        return True
+    ends = np.median(low), np.median(high)
+    apart = float(ends[1] - ends[0])
+    beside = max(float(np.abs(low - ends[0]).mean()), float(np.abs(high - ends[1]).mean()))
+    beyond = (values < ends[0] - 0.35 * apart) | (values > ends[1] + 0.35 * apart)  # ink in a shadow is darker still
+    return bool(apart > 2 * _CONTRAST and beside < 0.085 * apart + 2 and beyond.mean() < 0.003)
 
 
 def is_even(image: Image8) -> bool:

@@ -205,8 +205,7 @@ def as_picture(levels: Levels) -> Image8:
     values = levels.values.astype(np.float64)
     if not np.isfinite(values).all():
         raise StackgenError("holds values that are not finite; replace them by 0")
-    low, spread = values.min(), np.ptp(values)
-    raster = _of_image(_grey_image(np.round((values - low) * (255 / spread if spread else 0)).astype(np.uint8)))
+    raster = _of_image(_grey_image(as_bytes(values)))
     assert isinstance(raster, Image8)
     return raster
 
@@ -215,3 +214,9 @@ def _grey_image(values: NDArray[np.uint8]) -> Image:
     from PIL import Image
 
     return Image.fromarray(values)
+
+
+def as_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
+    """Stretch finite values (H, W) over 0..255."""
+    low, spread = float(values.min()), float(np.ptp(values))
+    return np.asarray(np.round((values.astype(np.float64) - low) * (255 / spread if spread else 0)), np.uint8)

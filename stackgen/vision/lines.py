@@ -122,18 +122,19 @@ def _bent(ink: Mask, start: float, slope: float, reach: int) -> NDArray[np.int64
     return np.asarray(offsets[smooth.argmax(axis=0)], dtype=np.int64)
 
 
-def without_ground(ink: Mask) -> tuple[Mask, bool]:
+def without_ground(ink: Mask) -> list[Mask]:
     """Remove a ground line: thin, nearly level, under the drawing, and longer than it.
 
     Returns:
-        The rest of the ink (H, W), and whether there was one.
+        Nothing where there is none; else the ink (H, W) without it, and without only what is beside the drawing, as
+        what stands on the line may have no line of its own there.
     """
     rows, columns = bounding_box(ink)
     size = max(rows.stop - rows.start, columns.stop - columns.start)
     lowest, thick, alone = _lowest_runs(ink, round(0.2 * size))
     thin = alone & (thick <= max(3, 0.045 * size))
     for free in _stretches(thin, round(0.03 * size)):
-        if np.count_nonzero(free) < 0.1 * size:
+        if np.count_nonzero(free) < 0.025 * size:
             continue
         path, width = _followed(ink, lowest, thick, free)
         body = ink.copy()
@@ -148,11 +149,13 @@ def without_ground(ink: Mask) -> tuple[Mask, bool]:
         if not body.any():
             continue
         foot = bounding_box(body)
-        long = np.count_nonzero(path >= 0) > 1.12 * (foot[1].stop - foot[1].start)
+        long = np.count_nonzero(path >= 0) > 1.04 * (foot[1].stop - foot[1].start)
         below = foot[0].stop - 1 <= np.median(path[path >= 0]) + 0.06 * size
         if long and below and body.sum() > 0.3 * ink.sum():
-            return body, True
-    return ink, False
+            under = body.copy()
+            under[:, foot[1]] = ink[:, foot[1]]
+            return [body, under]
+    return []
 
 
 def _lowest_runs(ink: Mask, room: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:

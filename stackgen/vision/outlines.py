@@ -9,7 +9,7 @@ Legend: H x W pixels, F faces; face 0 is what lies outside.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.vision.lines import without_ground
-from stackgen.vision.masks import bounding_box, closed, components, opened
+from stackgen.vision.masks import bounding_box, closed, components, largest, opened
 from stackgen.world import Mask
 
 Ints = NDArray[np.int64]
@@ -133,12 +133,13 @@ def _least_gap(ink: Mask, size: int) -> _Trial:
         trials.append(_trial(ink, size, gap))
         if gap == GAPS[0] and trials[0].loose < 0.05:
             return trials[0]
-    most = max(trial.enclosed for trial in trials)
-    return next(t for t in trials if t.enclosed >= 0.6 * most and t.loose <= min(u.loose for u in trials) + 0.1)
+    enough = [trial for trial in trials if trial.enclosed >= 0.6 * max(trial.enclosed for trial in trials)]
+    return next(trial for trial in enough if trial.loose <= min(other.loose for other in enough) + 0.1)
 
 
 def _trial(ink: Mask, size: int, gap: float) -> _Trial:
-    faces = _faces(closed(ink, gap * size), size)
+    drawn = closed(ink, gap * size)
+    faces = _faces(drawn, size)
     box = faces.ink[bounding_box(faces.ink)].size
     doors, opening = _open_faces(faces, size)
     inside = np.ones(len(faces.areas), dtype=bool)
@@ -147,12 +148,18 @@ def _trial(ink: Mask, size: int, gap: float) -> _Trial:
     large = inside & (faces.areas > LEAST_FACE * box)
     # Flecks between hatches are filled, but say nothing of outlines.
     stroke = _stroke(faces, large)
-    whole = inside[faces.labels] if stroke else faces.ink | inside[faces.labels]
+    whole = inside[faces.labels] if stroke else _without_whiskers(faces.ink | inside[faces.labels], size)
     if stroke:
-        body = opened(faces.ink, 0.95 * stroke)
-        whole |= body
+        whole |= opened(drawn, 0.95 * stroke)
     enclosed = int(faces.areas[large].sum())
     return _Trial(whole, stroke, _loose(faces.ink, whole, stroke), gap, enclosed, doors)
+
+
+def _without_whiskers(mask: Mask, size: int) -> Mask:
+    """Remove what is thin as a hair from something solid: lines of the paper that touch it."""
+    core = opened(mask, 0.01 * size)
+    near = cv2.distanceTransform((~core).astype(np.uint8), cv2.DIST_L2, 3) <= 0.015 * size
+    return np.asarray(near & mask) if core.any() else mask
 
 
 def _loose(ink: Mask, whole: Mask, stroke: float) -> float:
@@ -186,9 +193,7 @@ def _faces(ink: Mask, size: int) -> _Faces:
     labels, areas = components(~ink, connectivity=4)
     outside = labels[0, 0]
     width = cv2.distanceTransform(blank, cv2.DIST_L2, 3)
-    widest = np.zeros(len(areas))
-    np.maximum.at(widest, labels.ravel(), width.ravel())
-    kept = 2 * widest > THIN_FACE * size
+    kept = np.bincount(labels[2 * width > THIN_FACE * size], minlength=len(areas)) > 0
     kept[[0, outside]] = False, True
     ink = ~kept[labels]
     number = np.cumsum(kept)  # outside gets 0, the others follow
@@ -206,7 +211,8 @@ def _faces(ink: Mask, size: int) -> _Faces:
     touching = np.zeros((count, count), dtype=np.int64)
     for one, two in ((full[1:], full[:-1]), (full[:, 1:], full[:, :-1])):
         differs = one != two
-        np.add.at(touching, (one[differs], two[differs]), 1)
+        pairs = np.bincount(one[differs] * count + two[differs], minlength=count * count)
+        touching += pairs.reshape(count, count)
     return _Faces(ink, full, sizes, touching + touching.T, _solid_windows(ink, face, count, size))
 
 
@@ -313,6 +319,8 @@ def choose(ink: Mask, which: int | None = None, spread: bool = False) -> Filled:
     drawings = [part for part in found if isinstance(part, Filled)]
     if not drawings:
         raise next(part for part in found if isinstance(part, StackgenError))
+    if not spread:
+        drawings = [replace(part, mask=_main_part(part.mask)) for part in drawings]
     most = max(np.count_nonzero(part.mask) for part in drawings)
     rivals = [part for part in drawings if np.count_nonzero(part.mask) >= RIVAL * most]
     rivals.sort(key=lambda part: bounding_box(part.mask)[1].start)
@@ -351,20 +359,34 @@ def _groups(ink: Mask) -> list[Mask]:
 
 def _one(group: Mask) -> Filled | StackgenError:
     """Fill one group of ink, without the ground line under it; the error if its outline is open."""
-    body, grounded = without_ground(group)
+    note = "The ground line was left out."
     try:
-        filled = fill(body)
+        for body in without_ground(group):
+            filled = _filled(body)
+            if filled is not None and filled.sureness > 0.93:
+                return Filled(filled.mask, filled.stroke, (*filled.notes, note), filled.sureness)
+        return fill(group)
     except StackgenError as error:
         return error
-    if grounded:
-        return Filled(filled.mask, filled.stroke, (*filled.notes, "The ground line was left out."), filled.sureness)
-    return filled
+
+
+def _filled(ink: Mask) -> Filled | None:
+    try:
+        return fill(ink)
+    except StackgenError:
+        return None
+
+
+def _main_part(mask: Mask) -> Mask:
+    """Keep the largest part of a mask and what is right beside it: a name is drawn near the structure, too."""
+    rows, columns = bounding_box(mask)
+    return largest(mask, round(0.06 * max(rows.stop - rows.start, columns.stop - columns.start)))
 
 
 def _is_round(mask: Mask) -> bool:
     """Tell a sun from a structure: a circle covers more of the circle around it than any square does."""
-    points = np.argwhere(mask)[:, ::-1].astype(np.float32)
-    _, radius = cv2.minEnclosingCircle(points)
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    _, radius = cv2.minEnclosingCircle(cv2.convexHull(np.concatenate(contours)))
     return bool(np.count_nonzero(mask) > 0.8 * np.pi * radius**2)
 
 

@@ -19,7 +19,7 @@ from stackgen.errors import StackgenError
 from stackgen.vision.images import Picture
 from stackgen.vision.lines import without_rules
 from stackgen.vision.masks import components
-from stackgen.vision.sheets import Sheet, straightened
+from stackgen.vision.sheets import Sheet, least_channel, straightened
 from stackgen.world import Mask
 
 Floats = NDArray[np.float64]
@@ -84,7 +84,7 @@ def find_ink(sheet: Picture) -> tuple[Mask, NDArray[np.float32]]:
 
     Of the channels the darkest counts: a crayon of any colour takes the light of one.
     """
-    light = cv2.GaussianBlur(np.asarray(sheet.min(axis=2)), (0, 0), 0.8)
+    light = cv2.GaussianBlur(least_channel(sheet), (0, 0), 0.8)
     size = max(2, round(BESIDE * max(light.shape))) | 1
     paper = cv2.morphologyEx(cv2.medianBlur(light, 5), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
     darkness = 1 - (light.astype(np.float32) + 4) / (paper.astype(np.float32) + 4)
@@ -133,7 +133,6 @@ def _strong(ink: Mask, darkness: NDArray[np.float32]) -> Mask:
         return ink
     dark = float(np.quantile(darkness[ink], 0.97))
     labels, areas = components(ink)
-    most = np.zeros(len(areas))
-    np.maximum.at(most, labels.ravel(), darkness.ravel())
-    kept = (most > max(1.5 * FAINTEST, 0.35 * dark)) & (areas > 12)
+    darkest = np.bincount(labels[darkness > max(1.5 * FAINTEST, 0.35 * dark)], minlength=len(areas))
+    kept = (darkest > 0) & (areas > 12)
     return np.asarray(kept[labels])

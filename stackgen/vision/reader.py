@@ -24,7 +24,7 @@ from stackgen.vision.lines import without_rules
 from stackgen.vision.masks import bounding_box, filling, place
 from stackgen.vision.outlines import Filled, choose
 from stackgen.vision.photos import WORK_SIZE, read_page
-from stackgen.vision.sheets import Sheet, find_sheet
+from stackgen.vision.sheets import Sheet, find_sheet, straight_up
 from stackgen.world import Grid, Mask
 
 if TYPE_CHECKING:
@@ -36,6 +36,11 @@ PictureKind = Literal["drawing", "photo", "depth"]
 
 FIGURE = 512
 """Longer edge of a figure [pixel], about."""
+
+_UNCLEAR = (
+    "it seems to be the photo of a sheet whose edges are not clear;"
+    " crop it to the paper, or lay the sheet on a table that is darker"
+)
 
 _LEFT_OUT = 0.05
 """Share of the structure from which on what was left out, or added, is worth telling."""
@@ -138,9 +143,9 @@ def read_picture(
             return _of_frame(frame, depth_scale is not None, cell_size)
         image = raster if isinstance(raster, Image8) else images.as_picture(raster)
         sheet = None if as_ == "drawing" else _sheet(image)
-        if as_ == "photo" or (as_ is None and (sheet is not None or not drawings.is_even(image))):
+        if as_ == "photo" or (as_ is None and (sheet is not None or not drawings.is_drawing(image))):
             return _of_photo(image, sheet, which)
-        return _of_drawing(image, grid, which)
+        return _of_drawing(image, grid, which, insisted=as_ is not None)
     except StackgenError as error:
         raise StackgenError(f"{images.name_of(source)}: {error}") from error
 
@@ -177,15 +182,19 @@ def read_colours(path: str | Path) -> Picture:
 
 
 def _sheet(image: Image8) -> Sheet | None:
-    """Find the sheet in what may be a photo: a picture without noise, or with transparent parts, is none."""
-    return None if image.alpha is not None or drawings.is_flat(image) else find_sheet(image.colours)
+    """Find the sheet in what may be a photo: a picture of two even tones, or with transparent parts, is none."""
+    if image.alpha is not None or (drawings.is_flat(image) and drawings.is_two_tone(image)):
+        return None
+    return find_sheet(image.colours)
 
 
-def _of_drawing(image: Image8, grid: Grid, which: int | None) -> Reading:
+def _of_drawing(image: Image8, grid: Grid, which: int | None, insisted: bool) -> Reading:
     """Read a drawing on an even ground."""
     drawn = drawings.find_drawn(image)
     ink, _ = without_rules(drawn.ink, drawn.darkness)
     found = choose(ink, which, spread=True)
+    if not insisted and drawn.drawn_on(found.mask):
+        raise StackgenError(_UNCLEAR)
     sure = found.sureness * (0.8 if drawn.notes else 1.0)
     to_picture = np.array([[1 / drawn.scale, 0, drawn.place[0]], [0, 1 / drawn.scale, drawn.place[1]], [0, 0, 1]])
     overlay = _outlined(image.colours, found.mask, to_picture)
@@ -200,14 +209,19 @@ def _of_photo(image: Image8, sheet: Sheet | None, which: int | None) -> Reading:
         raise StackgenError(f"the photo is only {width} x {height} pixels; take a larger one")
     page = read_page(image.colours, sheet)
     found = choose(page.ink, which)
+    if sheet is None and cv2.contourArea(_hull(found.mask)) > 0.55 * found.mask.size:
+        raise StackgenError(_UNCLEAR)
     if _runs_off(found):
         raise StackgenError("the drawing runs off the sheet; leave some blank paper around it")
-    notes = page.notes if sheet is not None else (*page.notes, "No sheet's edge is seen: the whole photo is the sheet.")
-    sure = found.sureness * (1.0 if sheet is None else sheet.sureness) * min(1.0, 0.5 + page.contrast)
+    notes = (
+        page.notes if sheet is not None else (*page.notes, "No sheet's edges are seen, so proportions are uncertain.")
+    )
+    sure = found.sureness * (0.8 if sheet is None else sheet.sureness) * min(1.0, 0.5 + page.contrast)
     overlay = _outlined(image.colours, found.mask, np.asarray(np.linalg.inv(page.turn)))
+    upright = found.mask if sheet is not None else straight_up(found.mask)
     if sheet is not None:
         _polygon(overlay, sheet.corners, _GREEN)
-    return Reading(_figure(found.mask), "photo", sure, overlay, (*notes, *found.notes))
+    return Reading(_figure(upright), "photo", sure, overlay, (*notes, *found.notes))
 
 
 def _of_frame(frame: DepthFrame, scale_is_known: bool, cell_size: float | None) -> Reading:
@@ -229,6 +243,11 @@ def _of_frame(frame: DepthFrame, scale_is_known: bool, cell_size: float | None) 
     cell = None if cell_size is None else cell_size / height * len(figure)
     sure = float(np.clip(1 - found.left_out - found.failing, 0.2, 1))
     return Reading(figure, "depth", sure, shown, tuple(notes), cell)
+
+
+def _hull(mask: Mask) -> NDArray[np.int32]:
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    return np.asarray(cv2.convexHull(np.concatenate(contours)), np.int32)
 
 
 def _runs_off(found: Filled) -> bool:

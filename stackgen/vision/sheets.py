@@ -27,6 +27,9 @@ FOCAL = 0.75
 FOCALS = (0.6, 1.6)
 """Least and largest focal length that is believed, by the photo's longer edge."""
 
+SHEETS = (0.707, 0.773)
+"""Proportions of sheets of A4 and of Letter."""
+
 LEAST_SHEET = 0.12
 """A sheet is at least this share of the photo."""
 
@@ -54,43 +57,83 @@ def find_sheet(photo: Picture) -> Sheet | None:
     factor = _SEARCH / max(photo.shape[:2])
     small = np.asarray(cv2.resize(photo, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
     small = np.asarray(cv2.medianBlur(small, 5), np.uint8)
-    light = small.min(axis=2).astype(np.float32)
+    light, tint = least_channel(small).astype(np.float32), _tint(small)
     best: tuple[float, Floats] | None = None
     for region in _regions(small):
         corners = _quadrangle(region)
-        if corners is None:
+        if corners is None or _is_frame(corners, region.shape):
             continue
-        sureness = _support(light, _tint(small), corners)
+        sureness = _support(light, tint, corners)
         shape = np.array(small.shape[1::-1])
         area = cv2.contourArea(np.clip(corners, 0, shape).astype(np.float32)) / shape.prod()
         score = sureness * min(1.0, area / 0.25) ** 0.25
         if sureness >= SUPPORT and (best is None or score > best[0] + 1e-3):
             best = score, corners
-    return None if best is None else Sheet(best[1] / factor, min(1.0, best[0]))
+    if best is None:
+        return None
+    return Sheet(_refined(photo, best[1] / factor, reach=3 / factor), min(1.0, best[0]))
+
+
+def _refined(photo: Picture, corners: Floats, reach: float) -> Floats:
+    """Move the sides of a quadrangle to where the photo steps down most within some pixels of them."""
+    light = cv2.GaussianBlur(least_channel(photo), (0, 0), 1.0).astype(np.float32) + 8
+    middle = corners.mean(axis=0)
+    lines = []
+    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)
+        outward = np.array([along[1], -along[0]])
+        outward *= np.sign((start - middle) @ outward)
+        shifts = np.arange(-reach, reach + 0.5)
+        points = start + (end - start) * np.linspace(0.04, 0.96, 80)[:, None]
+        there = (points[:, None] + shifts[:, None] * outward).astype(np.float32)
+        seen = cv2.remap(light, there[..., 0], there[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        step = np.log(seen[:, :-2] / seen[:, 2:])
+        clear = step.max(axis=1) > 0.06
+        if np.count_nonzero(clear) < 25:
+            lines.append(np.array([start, end]))
+            continue
+        found = points[clear] + shifts[1 + step.argmax(axis=1)[clear], None] * outward
+        x, y, u, v = cv2.fitLine(found.astype(np.float32), cv2.DIST_HUBER, 0, 0.01, 0.01).ravel()[[2, 3, 0, 1]]
+        lines.append(np.array([[x, y], [x + u, y + v]], np.float64))
+    moved = np.array([_crossing(one, two) for one, two in zip(np.roll(lines, 1, axis=0), lines, strict=True)])
+    return moved if np.isfinite(moved).all() and np.abs(moved - corners).max() < 6 * reach else corners
+
+
+def least_channel(picture: Picture) -> NDArray[np.uint8]:
+    """Return the least channel (h, w) of a colour picture: that in which ink of any colour is dark, and wood, too."""
+    return np.asarray(cv2.min(cv2.min(picture[..., 0], picture[..., 1]), picture[..., 2]), np.uint8)
+
+
+def _is_frame(corners: Floats, shape: tuple[int, ...]) -> bool:
+    """Tell whether a quadrangle is a border along the picture's edges rather than a sheet."""
+    width, height = shape[1], shape[0]
+    ends = np.array([[0, 0], [width, 0], [width, height], [0, height]])
+    return bool(np.abs(corners - ends).max() < 0.05 * max(shape))
 
 
 def _tint(small: Picture) -> NDArray[np.float32]:
     """Return how colourless each pixel is, 255 for grey: least by largest channel, which a shadow hardly changes."""
-    values = small.astype(np.float32) + 8
-    return np.asarray(255 * values.min(axis=2) / values.max(axis=2), np.float32)
+    most = cv2.max(cv2.max(small[..., 0], small[..., 1]), small[..., 2]).astype(np.float32)
+    return np.asarray(255 * (least_channel(small).astype(np.float32) + 8) / (most + 8), np.float32)
 
 
 def _regions(small: Picture) -> Iterator[Mask]:
     """Propose regions (h, w) that may be the sheet."""
-    light, tint = small.min(axis=2), _tint(small).astype(np.uint8)
+    light, tint = least_channel(small), _tint(small).astype(np.uint8)
     for levels, shares in ((light, np.arange(1.1, 0.3, -0.08)), (tint, np.array([1.0, 0.95, 0.9]))):
         level, _ = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
         for share in shares:
             if share * level < 250:
                 yield levels > share * level
     yield from _flooded(small)
+    yield from _between_edges(small)
 
 
 def _flooded(small: Picture) -> Iterator[Mask]:
     """Propose what is reached from the lightest place without a sharp step: shadows end softly, paper does not."""
     soft = cv2.GaussianBlur(small, (0, 0), 1.0)
     paper = cv2.morphologyEx(soft, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
-    level = cv2.blur(paper.min(axis=2), (15, 15))
+    level = cv2.blur(least_channel(np.asarray(paper, np.uint8)), (15, 15))
     row, column = np.unravel_index(int(level.argmax()), level.shape)
     for step in (3, 5, 8):
         mask = np.zeros((small.shape[0] + 2, small.shape[1] + 2), np.uint8)
@@ -98,6 +141,24 @@ def _flooded(small: Picture) -> Iterator[Mask]:
             paper.copy(), mask, (int(column), int(row)), 0, (step,) * 3, (step,) * 3, 8 | cv2.FLOODFILL_MASK_ONLY
         )
         yield mask[1:-1, 1:-1] > 0
+
+
+def _between_edges(small: Picture) -> Iterator[Mask]:
+    """Propose what lies between edges, alone and by twos: a hard shadow divides a sheet."""
+    light = np.log(least_channel(small).astype(np.float32) + 12)
+    soft = cv2.GaussianBlur(cv2.morphologyEx(light, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)), (0, 0), 1.2)
+    steep = np.hypot(cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1))
+    for level in (0.12, 0.25):
+        _, labels, parts, _ = cv2.connectedComponentsWithStats((steep < level).astype(np.uint8), connectivity=4)
+        order = [
+            i for i in np.argsort(-parts[:, cv2.CC_STAT_AREA]) if i and parts[i, cv2.CC_STAT_AREA] > 0.02 * light.size
+        ]
+        masks = [labels == i for i in order[:5]]
+        yield from masks
+        for first in range(len(masks)):
+            for second in range(first):
+                joined = (masks[first] | masks[second]).astype(np.uint8)
+                yield cv2.morphologyEx(joined, cv2.MORPH_CLOSE, np.ones((11, 11), np.uint8)) > 0
 
 
 def _quadrangle(region: Mask) -> Floats | None:
@@ -122,7 +183,11 @@ def _quadrangle(region: Mask) -> Floats | None:
         return None
     corners = np.array([_crossing(one, two) for one, two in zip(np.roll(lines, 1, axis=0), lines, strict=True)])
     limits = 0.6 * np.array(region.shape[::-1])
-    if not np.isfinite(corners).all() or (corners < -limits).any() or (corners > 1.6 * np.array(region.shape[::-1])).any():
+    if (
+        not np.isfinite(corners).all()
+        or (corners < -limits).any()
+        or (corners > 1.6 * np.array(region.shape[::-1])).any()
+    ):
         return None
     flat = corners.astype(np.float32)
     inside = np.zeros(region.shape, np.uint8)
@@ -187,13 +252,22 @@ def _clockwise(corners: Floats) -> Floats:
     return np.roll(corners, -int(corners.sum(axis=1).argmin()), axis=0)
 
 
+def _usual(ratio: float) -> float:
+    """Return the proportions of the sheets that people have where they are near: those of A4 and of Letter."""
+    short = min(ratio, 1 / ratio)
+    near = min(SHEETS, key=lambda usual: abs(usual - short))
+    if abs(near - short) > 0.1 * near:
+        return ratio
+    return near if ratio < 1 else 1 / near
+
+
 def straightened(photo: Picture, corners: Floats, size: int) -> tuple[Picture, Floats]:
     """Show the sheet straight on.
 
     Returns:
         (h', w', 3) the sheet, `size` pixels for its longer edge, and the (3, 3) homography from photo to sheet.
     """
-    ratio = sheet_ratio(corners - np.array(photo.shape[1::-1]) / 2, max(photo.shape))
+    ratio = _usual(sheet_ratio(corners - np.array(photo.shape[1::-1]) / 2, max(photo.shape)))
     width, height = (size, round(size / ratio)) if ratio > 1 else (round(size * ratio), size)
     there = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float32)
     turn = cv2.getPerspectiveTransform(corners.astype(np.float32), there)
@@ -224,3 +298,74 @@ def sheet_ratio(corners: Floats, edge: float) -> float:
     focal = np.clip(np.sqrt(square), *FOCALS) if square > 0 else FOCAL
     lengths = [np.hypot(np.linalg.norm(vector[:2]) / focal, vector[2]) for vector in (across, down)]
     return float(np.clip(lengths[0] / lengths[1], 0.3, 3.3))
+
+
+def straight_up(mask: Mask) -> Mask:
+    """Turn a drawing (H, W) until its sides are level and upright, as those of blocks are.
+
+    It stands for the sheet where no edges of one are seen: the drawing's own sides tell how the photo was taken.
+    """
+    sides = _sides(mask)
+    level, upright = _turned(sides, upright=False), _turned(sides, upright=True)
+    if level is None or upright is None:
+        return mask
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    left, top, width, height = cv2.boundingRect(np.concatenate(contours))
+    rows = [(np.array([left + width / 2, y]), level[0] + level[1] * y) for y in (top, top + height)]
+    columns = [(np.array([x, top + height / 2]), upright[0] + upright[1] * x) for x in (left, left + width)]
+    lines = [np.array([p, p + [np.cos(a), np.sin(a)]]) for p, a in rows]
+    posts = [np.array([p, p + [-np.sin(a), np.cos(a)]]) for p, a in columns]
+    corners = np.array([_crossing(lines[i], posts[j]) for i, j in ((0, 0), (0, 1), (1, 1), (1, 0))])
+    if not np.isfinite(corners).all():
+        return mask
+    edges = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
+    ratio = (edges[0] + edges[2]) / (edges[1] + edges[3])
+    seen = sheet_ratio(corners - np.array(mask.shape[::-1]) / 2, max(mask.shape))
+    ratio = float(np.clip(seen, 0.6 * ratio, 1.7 * ratio))
+    size = max(mask.shape)
+    out = (int(0.8 * size * min(1.0, ratio)), int(0.8 * size * min(1.0, 1 / ratio)))
+    edge = 0.1 * size
+    there = np.array([[0, 0], [out[0], 0], out, [0, out[1]]], np.float32) + np.float32(edge)
+    turn = cv2.getPerspectiveTransform(corners.astype(np.float32), there)
+    canvas = (out[0] + int(2 * edge), out[1] + int(2 * edge))
+    turned = np.asarray(cv2.warpPerspective(mask.astype(np.float32), turn, canvas)) >= 0.5
+    return turned if turned.any() else mask
+
+
+def _sides(mask: Mask) -> Floats:
+    """Return the long straight sides (n, 4) of a drawing: middle x and y, angle [rad], length, of all its borders."""
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    size = max(max(cv2.boundingRect(contour)[2:]) for contour in contours)
+    found = []
+    for contour in contours:
+        points = cv2.approxPolyDP(contour, 0.02 * size, True)[:, 0].astype(np.float64)
+        for start, end in zip(points, np.roll(points, -1, axis=0), strict=True):
+            length = float(np.linalg.norm(end - start))
+            if length > 0.12 * size:
+                angle = float(np.arctan2(*(end - start)[::-1]))
+                found.append([*((start + end) / 2), angle, length])
+    return np.array(found).reshape(-1, 4)
+
+
+def _turned(sides: Floats, upright: bool) -> tuple[float, float] | None:
+    """Fit how far level or upright sides are turned [rad]: at 0, and by pixel across; None where there are none.
+
+    Args:
+        sides: (n, 4) as of `_sides`.
+        upright: Whether upright sides are meant.
+    """
+    if not len(sides):
+        return None
+    angles = (sides[:, 2] - (np.pi / 2 if upright else 0) + np.pi / 2) % np.pi - np.pi / 2
+    near = np.abs(angles) < np.radians(22)
+    if not near.any():
+        return None
+    angles, weights, across = angles[near], sides[near, 3], sides[near, 0 if upright else 1]
+    order = np.argsort(angles)
+    middle = float(angles[order][np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)])
+    alike = np.abs(angles - middle) < np.radians(9)
+    angles, weights, across = angles[alike], weights[alike] ** 2, across[alike]
+    mean, place = float(np.average(angles, weights=weights)), float(np.average(across, weights=weights))
+    spread = float(np.average((across - place) ** 2, weights=weights))
+    slope = float(np.average((angles - mean) * (across - place), weights=weights)) / (spread + 60.0**2)
+    return mean - slope * place, slope
