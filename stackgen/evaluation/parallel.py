@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from multiprocessing import get_context
 from typing import TYPE_CHECKING
 
+from stackgen.errors import StackgenError
+from stackgen.io.processes import end_with_parent, without_interrupts
 from stackgen.protocols import PhysicsNumbers, StabilityChecker, Verdict
 from stackgen.stack import Stack
 
@@ -61,7 +63,14 @@ class ParallelChecker(StabilityChecker):
 
     def check_all(self, stacks: Iterable[Stack]) -> list[Verdict]:
         """Give the verdicts on many stacks, in order."""
-        return list(self._pool.map(_check_in_worker, stacks, chunksize=8))
+        with without_interrupts():  # the processes start with their first work
+            answers = self._pool.map(_check_in_worker, stacks, chunksize=8)
+        try:
+            return list(answers)
+        except BrokenProcessPool as error:
+            raise StackgenError(
+                "a process that simulates died, killed perhaps for want of memory: try fewer --workers"
+            ) from error
 
     def close(self) -> None:
         """End the processes."""
@@ -76,7 +85,7 @@ class ParallelChecker(StabilityChecker):
 
 def _start_worker(factory: Callable[[], StabilityChecker]) -> None:
     global _worker_checker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that started this one
+    end_with_parent()
     _worker_checker = factory()
 
 

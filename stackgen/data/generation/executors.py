@@ -11,8 +11,6 @@ import contextlib
 import logging
 import multiprocessing
 import os
-import signal
-import threading
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -21,6 +19,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, Literal, Protocol, TypeVar
 
 from stackgen.errors import StackgenError, require
+from stackgen.io.processes import end_with_parent, without_interrupts
 
 ExecutorName = Literal["local", "ray"]
 T = TypeVar("T")
@@ -133,7 +132,7 @@ def _start(task: Callable[[int], T], number: int) -> _Worker:
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=_work, args=(task, there), daemon=True)
-    with _without_interrupts():
+    with without_interrupts():
         process.start()
     there.close()  # else the pipe would not end with the process
     worker = _Worker(process, here, number)
@@ -168,7 +167,7 @@ def _receive(worker: _Worker) -> _Answer | None:
 
 def _work(task: Callable[[int], T], pipe: Connection) -> None:
     """Answer numbers in the worker process until the pipe is closed."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    end_with_parent()
     with contextlib.suppress(EOFError, OSError):
         while True:
             number = pipe.recv()
@@ -179,24 +178,6 @@ def _work(task: Callable[[int], T], pipe: Connection) -> None:
             except Exception as error:  # noqa: BLE001 - raised again where it can be reported
                 answer = _Answer(error=error)
             pipe.send(answer)
-
-
-def _end_with_parent() -> None:
-    """End when the parent is gone, even if it was killed, and not only at the end of a shard."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-@contextlib.contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Processes that start here never see Ctrl-C: the parent alone answers it."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @dataclass(frozen=True)
