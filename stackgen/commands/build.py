@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
+from stackgen.commands.output import tell
 from stackgen.commands.parsing import Command, Files
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.commands.real_arm import RealArm, build_for_real, check_options, write_sheet
@@ -133,7 +134,7 @@ def main(
     _write(wanted, simulation, planned, content, result)
     _show(result)
     written = [wanted.out, *([simulation.video] if simulation.video else [])]
-    Console().print(f"wrote {' and '.join(map(str, written))}", highlight=False)
+    tell(f"wrote {' and '.join(map(str, written))}", wrote=written)
     return 0 if result.success else 1
 
 
@@ -196,10 +197,9 @@ def _from_image(image: Path, file: Path | None, wanted: Wanted, picture: Picture
         )
     assert found.block_list is not None and found.target is not None
     save_image(wanted.out / "silhouette.png", found.target)
-    for line in (f"read as a {reading.describe()}", *reading.notes):
-        Console().print(line, highlight=False, markup=False)
+    lines = [f"read as a {reading.describe()}", *reading.notes]
     blocks, best = format_block_list(found.block_list, found.world.catalogue), found.entries[0].front_iou
-    Console().print(f"{image.name}: {blocks}; {found.comment}; front IoU {best:.2f}", highlight=False)
+    tell(*lines, f"{image.name}: {blocks}; {found.comment}; front IoU {best:.2f}", read_as=reading.describe())
     return found
 
 
@@ -255,19 +255,18 @@ def _show(result: BuildReport) -> None:
             f"{block.clearance:.1f}",
             f"{block.seconds:.1f}",
         )
-    console = Console()
-    console.print(table)
+    tell(table, **result.to_json())
     for contact in result.unplanned:
-        console.print(f"[yellow]not planned: {contact}[/]", highlight=False)
-    word = "[green]built, and stands[/]" if result.success else "[red]" + _what_went_wrong(result) + "[/]"
+        tell(f"not planned: {contact}", style="yellow")
+    word = Text("built, and stands", "green") if result.success else Text(_what_went_wrong(result), "red")
     match = "" if result.iou_target is None else (
         f", front IoU with the target {result.iou_target:.2f} (as generated {result.generated_iou_target:.2f})"
     )  # fmt: skip
-    console.print(
-        f"{word}{match}; {result.order} order, least margin {result.least_margin:.1f}°;"
-        f" {result.seconds:.0f} s of the arm's time, {result.real_time_factor:.1f} times real time",
-        highlight=False,
+    words = (
+        f"{match}; {result.order} order, least margin {result.least_margin:.1f}°;"
+        f" {result.seconds:.0f} s of the arm's time, {result.real_time_factor:.1f} times real time"
     )
+    tell(Text.assemble(word, words))
 
 
 def _what_went_wrong(result: BuildReport) -> str:
@@ -290,6 +289,7 @@ COMMAND = Command(
     stackgen build examples/stacks/arch.json --arm ur-rtde --host 192.168.0.10 --execute
     """,
     files=Files("file", "FILE", "File of stacks (stacks.json).", optional=True),
+    reports=True,
     settings={"wanted": Wanted, "picture": PictureOptions, "simulation": Simulation, "real": RealArm},
     flags={
         "gui": "Show the build in a window, where there is a display.",

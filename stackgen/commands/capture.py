@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from stackgen.commands.output import tell, wrote
 from stackgen.commands.parsing import Command, Files
 from stackgen.errors import StackgenError
 from stackgen.geometry import iou
@@ -92,9 +93,10 @@ def main(
 
         model = load()
         block_list = model.predict_blocks(silhouette)
-        print(f"block list by the network: {format_block_list(block_list, model.world.catalogue)}")
+        blocks = format_block_list(block_list, model.world.catalogue)
+        tell(f"block list by the network: {blocks}", network_blocks=blocks)
     if expected is not None:
-        print(f"IoU with the truth: {iou(silhouette, expected):.3f}")
+        tell(f"IoU with the truth: {iou(silhouette, expected):.3f}", iou=iou(silhouette, expected))
 
 
 def _read(source: Source, picture: PictureOptions, image: Path | None) -> tuple[Reading, Mask | None]:
@@ -165,7 +167,8 @@ def _write(reading: Reading, silhouette: Mask, lines: Sequence[str], out: Path, 
     """Write both pictures, and print what was found."""
     save_image(out, silhouette)
     save_image(overlay, _beside(reading.overlay, silhouette))
-    print(*lines, f"wrote {out}", f"wrote {overlay}", sep="\n")
+    tell(*lines, read_as=reading.describe(), found=lines)
+    wrote(out, overlay)
 
 
 COMMAND = Command(
@@ -180,6 +183,7 @@ COMMAND = Command(
     """,
     files=Files("image", "IMAGE", "Drawing, photo of a sketch, or depth frame.", optional=True),
     settings={"source": Source, "picture": PictureOptions},
+    reports=True,
     flags={
         "realsense": "Take a frame from the first RealSense camera.",
         "freehand": "Write the silhouette as drawn or seen, not that of the cells it is made of.",

@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
 from stackgen.api import check
+from stackgen.commands.output import tell, wrote
 from stackgen.commands.parsing import Command, Files
-from stackgen.commands.verdict_table import FALLS, STANDS, verdict_table
+from stackgen.commands.verdict_table import FALLS, STANDS, verdict_facts, verdict_table
 from stackgen.io.stacks_file import StackEntry, read_stacks, write_stacks
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
@@ -27,7 +27,7 @@ def main(
     """Simulate the structures of a stacks file and say which stand; the exit code is 1 if any falls.
 
     Args:
-        file: File of stacks (stacks.json), made by stackgen or written by hand.
+        file: File of stacks (stacks.json), made by stackgen or written by hand; `-` is standard input.
         out: File to write the stacks to, with verdicts and settled poses, and with --explain also margins.
         explain: Whether to ask statics, too, and to say why blocks cannot be held.
         physics: Numbers of the simulation; what is not given is as in the file, as far as it describes the blocks.
@@ -39,12 +39,14 @@ def main(
         replace(check(checker, entry.stack, content.target, content.world.grid), comment=entry.comment)
         for entry in content.entries
     )
-    Console().print(verdict_table("file", [(file.name, entries)]))
+    tell(verdict_table("file", [(file.name, entries)]))
     if explain:
         entries, statics = _explained(entries, physics)
-        Console().print("", statics, sep="\n")
+        tell("", statics)
+    tell(physics=physics.to_json(), stacks=[verdict_facts(entry) for entry in entries])
     if out is not None:
         write_stacks(out, replace(content, entries=entries, physics=physics.to_json()))
+        wrote(out)
     return 0 if all(entry.verdict and entry.verdict.stable for entry in entries) else 1
 
 
@@ -80,8 +82,12 @@ COMMAND = Command(
     stackgen check out/arch/stacks.json
     stackgen check mine.json --out checked.json --physics.friction 0.3
     stackgen check examples/stacks/cantilever.json --explain
+    stackgen check - --json < mine.json
     """,
-    files=Files("file", "FILE", "File of stacks (stacks.json), made by stackgen or written by hand."),
+    files=Files(
+        "file", "FILE", "File of stacks (stacks.json), made by stackgen or written by hand; - is standard input."
+    ),
+    reports=True,
     flags={"explain": "Also ask statics for margins, and why blocks cannot be held."},
 )
 

@@ -7,10 +7,11 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
+from stackgen.commands.output import tell, wrote
 from stackgen.commands.parsing import Command, Files, epilog
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.data.card import write_card
@@ -39,14 +40,16 @@ def verify(folder: Path) -> int:
         problems = find_problems(folder, advance)
     if not problems:
         stacks = sum(manifest.count(split) for split in SPLITS)
-        print(f"{folder}: {len(manifest.shards)} shards with {stacks:,} stacks are as they were written")
+        line = f"{folder}: {len(manifest.shards)} shards with {stacks:,} stacks are as they were written"
+        tell(line, sound=True, shards=len(manifest.shards), stacks=stacks, problems=[])
         return 0
     table = Table("file", "is", "", box=None, pad_edge=False)
     for problem in problems:
         table.add_row(escape(problem.file), f"[red]{problem.fault}[/]", escape(problem.detail))
-    Console().print(table)
+    found = [{"file": problem.file, "is": problem.fault, "detail": problem.detail} for problem in problems]
+    tell(table, sound=False, problems=found)
     if any(problem.breaks_bytes for problem in problems):
-        print(f"make the lost shards again: stackgen dataset repair {folder}")
+        tell(f"make the lost shards again: stackgen dataset repair {folder}")
     return 1
 
 
@@ -67,12 +70,13 @@ def repair(
 
     with progress_bar("making shards again") as (advance, _):
         done = make_again(folder, make_executor(executor, workers), other_bytes, advance)
+    tell(identical=done.identical, other=done.other)
     for name in done.identical:
-        print(f"made {folder / name} again, byte for byte")
+        tell(f"made {folder / name} again, byte for byte")
     for name in done.other:
-        print(f"made {folder / name} again, with other bytes: dataset.json and the dataset's hash have changed")
+        tell(f"made {folder / name} again, with other bytes: dataset.json and the dataset's hash have changed")
     if not done.identical and not done.other:
-        print(f"{folder}: every shard is as it was written; nothing to repair")
+        tell(f"{folder}: every shard is as it was written; nothing to repair")
 
 
 def info(folder: Path, out: Path | None = None, margins: int = 500, samples: int = 24, seed: int = 0) -> None:
@@ -108,7 +112,7 @@ def info(folder: Path, out: Path | None = None, margins: int = 500, samples: int
         written.append("samples.png")
     if out is None and write_card(folder, contents.manifest, paragraphs(found, written[1:])):
         written.append("README.md")
-    print("\n".join(f"wrote {place / name}" for name in written))
+    wrote(*(place / name for name in written))
 
 
 def split(
@@ -145,9 +149,9 @@ def split(
         column.justify = "right"
     for name, row in rows.items():
         table.add_row(name, *(f"{number:,}" for number in row.values()))
-    Console().print(table)
+    tell(table, splits=rows)
     if out is not None:
-        print(f"wrote {out}; sha256 {manifest.sha256[:12]}")
+        tell(f"wrote {out}; sha256 {manifest.sha256[:12]}", wrote=[out], sha256=manifest.sha256)
 
 
 def export(folder: Path, out: Path) -> None:
@@ -164,7 +168,8 @@ def export(folder: Path, out: Path) -> None:
     save_npz(out, splits, dataset.manifest)
     size = out.stat().st_size
     large = "" if size <= EASY_TO_SEND else f" (more than the {EASY_TO_SEND / 2**20:g} MiB that are easy to send along)"
-    print(f"wrote {out}: {sum(map(len, splits.values())):,} stacks, {size / 2**20:.1f} MiB{large}")
+    stacks = sum(map(len, splits.values()))
+    tell(f"wrote {out}: {stacks:,} stacks, {size / 2**20:.1f} MiB{large}", wrote=[out], stacks=stacks, bytes=size)
 
 
 def _statics(manifest: Manifest) -> StabilityChecker:
@@ -178,30 +183,30 @@ def _print_facts(found: Mapping[str, Any]) -> None:
     """Print what `dataset info` found."""
     from stackgen.data.inspection.plots import duplicate_words, margin_words, nearness_words
 
-    console = Console()
-    console.print(f"[bold]{escape(found['name'])}[/]: {found['stacks']:,} stacks")
+    tell(Text.assemble((found["name"], "bold"), f": {found['stacks']:,} stacks"), **found)
     for name, tally in found["counts"].items():
         table = Table(escape(name), *tally, box=None, pad_edge=False)
         table.add_row("", *(f"{number:,}" for number in tally.values()))
-        console.print("", table, sep="\n")
+        tell("", table)
     table = Table("of all blocks", *next(iter(found["distributions"].values())), box=None, pad_edge=False)
     for name, values in found["distributions"].items():
         table.add_row(escape(name), *(f"{value:.4f}" for value in values.values()))
-    console.print("", table, sep="\n")
+    tell("", table)
     for words in (margin_words(found), duplicate_words(found), *nearness_words(found)):
         if words:
-            console.print("", escape(words), sep="\n", highlight=False)
+            tell("", words)
 
 
 _FOLDER = Files("folder", "FOLDER", "Folder of the dataset.")
 
 COMMANDS = {
-    "verify": Command("dataset verify", verify, "stackgen dataset verify data/paper", files=_FOLDER),
+    "verify": Command("dataset verify", verify, "stackgen dataset verify data/paper", files=_FOLDER, reports=True),
     "repair": Command(
         "dataset repair",
         repair,
         "stackgen dataset repair data/paper\nstackgen dataset repair data/paper --workers 4",
         files=_FOLDER,
+        reports=True,
         flags={"other_bytes": "Accept shards with other bytes; dataset.json gets their checksums."},
     ),
     "info": Command(
@@ -209,6 +214,7 @@ COMMANDS = {
         info,
         "stackgen dataset info data/paper\nstackgen dataset info data/paper.npz --out out/paper --margins 2000",
         files=Files("folder", "FOLDER", "Folder of the dataset, or its compact .npz file."),
+        reports=True,
     ),
     "split": Command(
         "dataset split",
@@ -217,12 +223,14 @@ COMMANDS = {
         "stackgen dataset split data/paper --validation 0.05 --test 0.1 --out data/other\n"
         "stackgen dataset split data/paper --validation 0.05 --test 0.1 --by layout --out data/strict",
         files=_FOLDER,
+        reports=True,
     ),
     "export": Command(
         "dataset export",
         export,
         "stackgen dataset export data/paper --out data/paper.npz",
         files=_FOLDER,
+        reports=True,
     ),
 }
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from stackgen.commands.output import wrote
 from stackgen.commands.parsing import Command, Files
 
 
@@ -19,7 +20,7 @@ def main(checkpoint: Path, out: Path, half: bool = False) -> None:
     from stackgen.models.weights import export_checkpoint, last_checkpoint  # loads torch, which --help does without
 
     export_checkpoint(last_checkpoint(checkpoint) if checkpoint.is_dir() else checkpoint, out, half=half)
-    print(f"wrote {out}\nwrote {out.with_suffix('.json')}")
+    wrote(out, out.with_suffix(".json"))
 
 
 COMMAND = Command(
@@ -30,6 +31,7 @@ COMMAND = Command(
     stackgen export runs/ddpm-small --out ddpm-small.safetensors
     stackgen export runs/tran-reg --out tran-reg.safetensors --half
     """,
+    reports=True,
     flags={"half": "Store matrices as 16-bit floats, which halves the size."},
     files=Files("checkpoint", "CHECKPOINT", "Checkpoint (.ckpt) of `stackgen fit`, or the folder of a run."),
 )

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from stackgen.commands.output import tell
 from stackgen.commands.parsing import Command
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.data.generation.executors import ExecutorName, make_executor
@@ -46,10 +47,12 @@ def main(
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"finished shards are kept in {out}; the same command continues from there") from None
     if shards is not None:
-        print(f"shards {shards.start} to {shards.stop - 1} of {out} are there: {stacks} stacks")
+        line = f"shards {shards.start} to {shards.stop - 1} of {out} are there: {stacks} stacks"
+        tell(line, folder=out, shards=[*shards], stacks=stacks)
         return
-    counts = ", ".join(f"{manifest.count(split)} {split}" for split in SPLITS)
-    print(f"wrote {out}: {counts}; sha256 {manifest.sha256[:12]}")
+    counts = {split: manifest.count(split) for split in SPLITS}
+    line = f"wrote {out}: {', '.join(f'{n} {split}' for split, n in counts.items())}; sha256 {manifest.sha256[:12]}"
+    tell(line, folder=out, stacks=counts, sha256=manifest.sha256)
 
 
 def _range(text: str) -> range:
@@ -73,6 +76,7 @@ COMMAND = Command(
     stackgen generate --config configs/generate/paper.yaml --out data/paper --shard_range 0:40
     """,
     settings={"settings": GenerateSettings},
+    reports=True,
 )
 
 

@@ -26,6 +26,7 @@ from jsonargparse.typing import register_type
 
 from stackgen.commands.hints import did_you_mean
 from stackgen.commands.old_names import renew
+from stackgen.commands.output import FORMS, chosen, telling
 from stackgen.errors import StackgenError
 from stackgen.io.text import parse_yaml, read_text, to_yaml
 
@@ -131,6 +132,7 @@ class Command:
             prefix.
         flags: Boolean parameters that are switched on by naming them, with their help.
         hidden: Options whose parts (`cell` for `--cell.*`) only `--help=all` shows.
+        reports: Whether it tells what it found through `commands.output`: it then has --json and --quiet.
         interpolation: Whether `${...}` in configuration files stands for another option's value.
         config: Parameter that takes the text of all options as YAML, to be kept with what the verb makes.
     """
@@ -142,6 +144,7 @@ class Command:
     settings: Mapping[str, type] = field(default_factory=dict)
     flags: Mapping[str, str] = field(default_factory=dict)
     hidden: tuple[str, ...] = ()
+    reports: bool = False
     interpolation: bool = True
     config: str | None = None
 
@@ -170,6 +173,8 @@ class Command:
             parser.add_class_arguments(kind, skip=set(self.flags), sub_configs=True, as_group=False)
         for name, text in self.flags.items():
             parser.add_argument(f"--{name}", action="store_true", help=text)
+        for name, text in FORMS.items() if self.reports else ():
+            parser.add_argument(f"--{name}", action="store_true", help=text)
         special: set[str | int] = {*self.flags, *self.settings, *((self.config,) if self.config else ())}
         if self.files:
             special.add(self.files.parameter)
@@ -190,13 +195,15 @@ class Command:
             self._shorten_help(parser)
         values = parse(parser, self.verb, own_sections(self.verb, argv))
         values.pop("config", None)
+        form = chosen(values.pop("json", False), values.pop("quiet", False))
         text = parser.dump(values, skip_unset=False) if self.config else ""
         options = vars(parser.instantiate(values))
         if self.config:
             options[self.config] = text
         for name, kind in self.settings.items():
             options[name] = kind(**{item.name: options.pop(item.name) for item in fields(kind)})
-        return self.function(**options)
+        with telling(form):
+            return self.function(**options)
 
     def _shorten_help(self, parser: ArgumentParser) -> None:
         """Leave the hidden options out of a parser's help, and say where they are."""

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from stackgen.commands.asking import arguments_of, load_both, open_run
+from stackgen.commands.output import tell
 from stackgen.commands.parsing import Command
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.data.manifest import Split
@@ -71,7 +72,7 @@ def main(
                 )
                 write_stacks(folder / f"{scene.name}.json", content)
             advance(start + len(batch))
-    print(f"wrote {len(scenes)} stacks files to {folder}")
+    tell(f"wrote {len(scenes)} stacks files to {folder}", folder=folder, scenes=len(scenes))
 
 
 COMMAND = Command(
@@ -82,6 +83,7 @@ COMMAND = Command(
     stackgen predict --test_set data/paper --split validation --limit 100
     """,
     settings={"subject": Method},
+    reports=True,
     config="config",
 )
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
 
+from stackgen.commands.output import tell
 from stackgen.commands.parsing import Command
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.errors import StackgenError
@@ -65,9 +65,8 @@ def main(
         )
     pairs.save(out)
     sampled = len(chosen) * num_samples
-    Console().print(
-        f"{len(pairs)} of {sampled} samples failed ({len(pairs) / sampled:.1%}); wrote {out}", highlight=False
-    )
+    line = f"{len(pairs)} of {sampled} samples failed ({len(pairs) / sampled:.1%}); wrote {out}"
+    tell(line, failed=len(pairs), sampled=sampled, wrote=[out])
 
 
 COMMAND = Command(
@@ -77,6 +76,7 @@ COMMAND = Command(
     stackgen prefer --data data/paper --weights runs/ours --out data/verdicts.npz
     stackgen fit --config configs/model/ddpm-verdicts.yaml --data.path data/paper
     """,
+    reports=True,
 )
 
 

@@ -10,6 +10,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from stackgen.commands.output import is_quiet
+
 
 class Advance(Protocol):
     """A function that is given how much is done, and the total if that was not known before."""
@@ -44,10 +46,10 @@ def progress_bar(what: str, total: int | None = None) -> Iterator[tuple[Advance,
         TimeRemainingColumn(),
     )
     screen = Console(stderr=True)
-    with Progress(*columns, console=screen, disable=not screen.is_terminal) as progress:
+    with Progress(*columns, console=screen, disable=not screen.is_terminal or is_quiet()) as progress:
         task = progress.add_task(what, total=total)
 
         def advance(done: int, total: int | None = None) -> None:
             progress.update(task, completed=done, total=total)
 
-        yield advance, lambda line: screen.print(escape(line), highlight=False, soft_wrap=True)
+        yield advance, lambda line: None if is_quiet() else screen.print(escape(line), highlight=False, soft_wrap=True)

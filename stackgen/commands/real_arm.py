@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rich.console import Console
-
+from stackgen.commands.output import tell, wrote
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.errors import StackgenError
 from stackgen.robot.real.gripper import Gripper
@@ -85,7 +84,7 @@ def write_sheet(real: RealArm, planned: PlannedBuild) -> None:
 
     plan, size = planned.plan, planned.physics.cell_size
     write_staging_sheet(real.staging_sheet, plan.stack, order=plan.order, workcell=planned.workcell, cell_size=size)
-    Console().print(f"wrote {real.staging_sheet}", highlight=False)
+    wrote(real.staging_sheet)
 
 
 def build_for_real(planned: PlannedBuild, real: RealArm, out: Path) -> int:
@@ -105,19 +104,18 @@ def build_for_real(planned: PlannedBuild, real: RealArm, out: Path) -> int:
         resume=real.resume,
     )
     show(build)
-    console = Console()
-    console.print(f"wrote {out / PROGRAM}", highlight=False)
+    wrote(out / PROGRAM)
     if not real.execute:
-        console.print("dry run: nothing has moved; --execute moves the arm", highlight=False)
+        tell("dry run: nothing has moved; --execute moves the arm", executed=False)
         return 0
     confirm(build, real.address, real.yes)
     if real.arm == "urscript":
         send(build, real.address)
-        console.print(f"sent to {real.address}, which builds on its own now", highlight=False)
+        tell(f"sent to {real.address}, which builds on its own now", executed=True)
         return 0
     from stackgen.robot.real.ur_arm import client_messages
 
     with client_messages(out / MESSAGES), progress_bar("build", len(planned.plan.order)) as (advance, _):
         progress = carry_out(build, real.address, advance)
-    console.print(f"[green]built: {progress.describe()}[/]", highlight=False)
+    tell(f"built: {progress.describe()}", style="green", executed=True)
     return 0

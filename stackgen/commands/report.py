@@ -6,9 +6,8 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from stackgen.commands.asking import arguments_of
+from stackgen.commands.output import tell
 from stackgen.commands.parsing import CONFIG_FLAGS, Command, option_values
 from stackgen.commands.progress_bar import after, progress_bar
 from stackgen.errors import StackgenError
@@ -25,6 +24,7 @@ from stackgen.evaluation.report.tasks import Task, tasks_of
 from stackgen.evaluation.results import Evaluation, write_csv
 from stackgen.io.files import write_atomically, write_json
 from stackgen.io.provenance import code_version, cores, machine
+from stackgen.io.text import read_json
 from stackgen.protocols import StabilityChecker
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
@@ -55,7 +55,7 @@ def main(
         cache: Folder in which results are kept.
         runs: Folder in which `stackgen test` left its runs.
     """
-    began, console = time.perf_counter(), Console()
+    began = time.perf_counter()
     check_rows(settings.rows)
     if (limit is not None and limit < 1) or (workers is not None and workers < 1):
         raise StackgenError("--limit and --workers must be at least 1")
@@ -76,20 +76,20 @@ def main(
         test_set = {"name": manifest.name, "sha256": manifest.sha256}
         facts = {"code": conditions.code, "machine": conditions.machine, "dataset": test_set}
         tasks = tasks_of(settings, manifest, len(scenes), physics=conditions.physics, facts=facts)
-        answers = gather(tasks, scenes, checker, Store(cache, runs), console)
-    limits, unseen = _references(settings, conditions, console)
+        answers = gather(tasks, scenes, checker, Store(cache, runs))
+    limits, unseen = _references(settings, conditions)
     results = [result_of(t.row, answers[t.place], t.question, limit=limits, unseen=unseen) for t in tasks]
     pictures = draw_charts(results, out)
     whole = SimulatorChecker(physics)  # for the pictures: what falls, falls to the end
     pictures += draw_sheets(results, {scene.name: scene for scene in scenes}, whole, out, grid=dataset.world.grid)
     write_report(Report(results, conditions, unseen, settings.groundwork), pictures, out)
-    console.print(terminal_table(results))
-    console.print(f"wrote {out}/table.md, .csv, .json and the pictures beside it", highlight=False)
-    _tell_costs(results, settings, time.perf_counter() - began, console)
+    tell(terminal_table(results), f"wrote {out}/table.md, .csv, .json and the pictures beside it")
+    tell(**read_json(out / "table.json"), wrote=[out])
+    _tell_costs(results, settings, time.perf_counter() - began)
 
 
 def gather(
-    tasks: Sequence[Task], scenes: Sequence[Scene], checker: StabilityChecker, store: Store, console: Console
+    tasks: Sequence[Task], scenes: Sequence[Scene], checker: StabilityChecker, store: Store
 ) -> dict[tuple[str, str], Evaluation]:
     """Find the answers that are kept, run what is missing, and keep that at once."""
     answers: dict[tuple[str, str], Evaluation] = {}
@@ -98,9 +98,9 @@ def gather(
         if found:
             answers[task.place] = found[0]
         state = f"kept in {found[1]}" if found else "to be run"
-        console.print(f"{_title(task)}: {state}", highlight=False)
+        tell(f"{_title(task)}: {state}")
         for path, remark in store.left_out(task.question):
-            console.print(f"  left out {path}: {remark}", style="yellow", highlight=False)
+            tell(f"  left out {path}: {remark}", style="yellow")
     missing = [task for task in tasks if task.place not in answers]
     return answers | _run(missing, scenes, checker, store)
 
@@ -130,20 +130,18 @@ def _run(
     return answers
 
 
-def _references(
-    settings: ReportSettings, conditions: Conditions, console: Console
-) -> tuple[DiversityLimit | None, Unseen | None]:
+def _references(settings: ReportSettings, conditions: Conditions) -> tuple[DiversityLimit | None, Unseen | None]:
     """Read what is known of the scenes, or say what is left out of the report."""
     limit, unseen = None, None
     try:
         if settings.diversity_limit is not None:
             limit = read_diversity_limit(settings.diversity_limit, conditions.test_set[1], conditions.physics)
     except StackgenError as error:
-        console.print(f"no diversity limit: {error}", style="yellow", highlight=False)
+        tell(f"no diversity limit: {error}", style="yellow")
     try:
         unseen = read_unseen(conditions.test_set[1], settings.training_sets)
     except StackgenError as error:
-        console.print(f"no metrics on unseen scenes: {error}", style="yellow", highlight=False)
+        tell(f"no metrics on unseen scenes: {error}", style="yellow")
     return limit, unseen
 
 
@@ -158,15 +156,15 @@ def write_report(report: Report, pictures: Sequence[str], out: Path) -> None:
     write_atomically(out / "table.md", to_markdown(report, pictures).encode())
 
 
-def _tell_costs(results: Sequence[Result], settings: ReportSettings, spent: float, console: Console) -> None:
+def _tell_costs(results: Sequence[Result], settings: ReportSettings, spent: float) -> None:
     """Say what this report took, what all rows take from their weights, and what training them took."""
     again = run_seconds(results)
     hours = sum(training.hours for training in trainings(settings.rows, settings.groundwork))
-    console.print(
+    tell(
         f"This report took {spent / 60:.1f} minutes. From shipped weights, with nothing kept, it takes "
         f"{again / 60:.1f} minutes and the pictures. From scratch, {hours:.1f} hours of generating and training come "
         "before that; the commands are at the end of table.md.",
-        highlight=False,
+        seconds=spent,
     )
 
 
@@ -179,6 +177,7 @@ COMMAND = Command(
     stackgen report --config configs/report.yaml --out docs/results
     """,
     settings={"settings": ReportSettings},
+    reports=True,
 )
 
 

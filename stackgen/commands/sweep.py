@@ -6,8 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
+from stackgen.commands import output
 from stackgen.commands.parsing import Command
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.errors import StackgenError, require
@@ -43,9 +42,9 @@ def main(sweep: Sweep, out: Path | None = None, parallel: int = 1, seed: int = 0
         except KeyboardInterrupt:
             raise KeyboardInterrupt("the same command continues the sweep") from None
     written = write_findings(study, sweep, folder)
-    Console().print(leaderboard_table(ranking(study), sweep))
-    print(*(f"wrote {path}" for path in written), sep="\n")
-    print(f"to look at every trial: optuna-dashboard {folder / JOURNAL}")
+    output.tell(leaderboard_table(ranking(study), sweep), folder=folder)
+    output.wrote(*written)
+    output.tell(f"to look at every trial: optuna-dashboard {folder / JOURNAL}")
 
 
 COMMAND = Command(
@@ -57,6 +56,7 @@ COMMAND = Command(
     stackgen sweep --config configs/sweeps/ddpm.yaml --export_wandb > sweep.yaml
     """,
     settings={"sweep": Sweep},
+    reports=True,
     flags={"export_wandb": "Print the file for `wandb sweep` instead of running it."},
     interpolation=False,  # `${args}` of a sweep file is for W&B
 )

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-
 from stackgen.commands.asking import arguments_of, load_both, open_run
+from stackgen.commands.output import tell, wrote
 from stackgen.commands.parsing import Command
 from stackgen.commands.progress_bar import after, progress_bar
 from stackgen.errors import StackgenError
@@ -18,6 +17,7 @@ from stackgen.evaluation.requests import Method, question_of
 from stackgen.evaluation.results import Evaluation, write_evaluation, write_metrics, write_scenes
 from stackgen.evaluation.tables import list_table, metrics_table
 from stackgen.io.provenance import code_version
+from stackgen.io.text import read_json
 from stackgen.sim.other_physics import warn_of_other_physics
 from stackgen.training.runs import RUNS
 
@@ -61,7 +61,7 @@ def main(
     if workers < 1:
         raise StackgenError(f"--workers must be at least 1, got {workers}")
     loaded, scenes, dataset = load_both(subject, ckpt_path, test_set, limit)
-    manifest, console = dataset.manifest, Console()
+    manifest = dataset.manifest
     facts = {"code": code_version(), "dataset": {"name": manifest.name, "sha256": manifest.sha256}}
     requests = loaded.requests(
         method, num_samples, seed, predicted_lists=predicted_lists, batch_size=batch_size, facts=facts
@@ -84,15 +84,9 @@ def main(
     for evaluation in found:
         words = f"{evaluation.method} {evaluation.block_list}".lower()
         write_scenes(folder / f"scenes-{''.join(c if c.isalnum() else '-' for c in words)}.csv", evaluation)
-    _show(found, console)
-    console.print(f"wrote {folder / 'metrics.json'}", highlight=False)
-
-
-def _show(evaluations: Sequence[Evaluation], console: Console) -> None:
-    console.print(metrics_table(evaluations))
-    lists = list_table(evaluations)
-    if lists is not None:
-        console.print(lists)
+    lists = list_table(found)
+    tell(metrics_table(found), *([] if lists is None else [lists]), **read_json(folder / "metrics.json"))
+    wrote(folder / "metrics.json")
 
 
 COMMAND = Command(
@@ -104,6 +98,7 @@ COMMAND = Command(
     stackgen test --config configs/baselines/brute-force.yaml --limit 128 --workers 2
     """,
     settings={"subject": Method},
+    reports=True,
     config="config",
 )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 from rich.markup import escape
@@ -40,6 +41,19 @@ def verdict_table(heading: str, sources: Iterable[tuple[str, Sequence[StackEntry
                 escape(describe_fall(entry.stack, entry.verdict, most)) if entry.verdict else "",
             )
     return table
+
+
+def verdict_facts(entry: StackEntry) -> dict[str, Any]:
+    """Give what programs are told of a stack: verdict, drops [cell], margin [rad] where it is known, and fit."""
+    verdict = entry.verdict
+    known = verdict and {
+        "stands": verdict.stable,
+        "at_rest": verdict.at_rest,
+        "fell": np.flatnonzero(verdict.fell),
+        "drop": verdict.drop,
+        "margin": verdict.margin,
+    }
+    return {"verdict": known, "front_iou": entry.front_iou, "matches": entry.matches}
 
 
 def describe_fall(stack: Stack, verdict: Verdict, most: int | None = None) -> str:

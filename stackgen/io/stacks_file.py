@@ -10,6 +10,7 @@ import base64
 import binascii
 import json
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -109,7 +110,7 @@ class StacksFile:
 
 
 def read_stacks(path: str | Path) -> StacksFile:
-    """Read and check a stacks file.
+    """Read and check a stacks file; `-` is standard input.
 
     Raises:
         StackgenError: If it is missing, not JSON, of another format, or says something impossible; the
@@ -198,7 +199,8 @@ def schema() -> dict[str, Any]:
 
 def _text(path: Path) -> str:
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        content = sys.stdin.buffer.read() if path == Path("-") else path.read_bytes()
+        text = content.decode("utf-8-sig")
     except FileNotFoundError:
         raise StackgenError("no such file") from None
     except IsADirectoryError:
