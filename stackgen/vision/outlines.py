@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.vision.lines import without_ground
-from stackgen.vision.masks import bounding_box, closed, components, largest, opened
+from stackgen.vision.masks import bounding_box, components, largest, opened
 from stackgen.world import Mask
 
 Ints = NDArray[np.int64]
@@ -138,7 +138,7 @@ def _least_gap(ink: Mask, size: int) -> _Trial:
 
 
 def _trial(ink: Mask, size: int, gap: float) -> _Trial:
-    drawn = closed(ink, gap * size)
+    drawn = _bridged(ink, gap * size) if gap else ink
     faces = _faces(drawn, size)
     box = faces.ink[bounding_box(faces.ink)].size
     doors, opening = _open_faces(faces, size)
@@ -153,6 +153,24 @@ def _trial(ink: Mask, size: int, gap: float) -> _Trial:
         whole |= opened(drawn, 0.95 * stroke)
     enclosed = int(faces.areas[large].sum())
     return _Trial(whole, stroke, _loose(faces.ink, whole, stroke), gap, enclosed, doors)
+
+
+def _bridged(ink: Mask, reach: float) -> Mask:
+    """Draw lines across gaps in outlines of up to twice a reach [pixel].
+
+    What lies further from all ink than the reach tells inside from outside; where both meet there is a line.
+    """
+    blank, _ = components(~ink, connectivity=4)
+    outside = blank == blank[0, 0]
+    far = cv2.distanceTransform((~ink).astype(np.uint8), cv2.DIST_L2, 5) > reach
+    seeds, _ = components(far & outside, connectivity=4)
+    barrier = np.where(seeds > 0, 0, 1).astype(np.uint8)
+    _, nearest = cv2.distanceTransformWithLabels(barrier, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    of_pixel = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
+    of_pixel[nearest[seeds > 0]] = seeds[seeds > 0]
+    sides = of_pixel[nearest].astype(np.float32)
+    low, high = cv2.erode(sides, np.ones((3, 3), np.uint8)), cv2.dilate(sides, np.ones((3, 3), np.uint8))
+    return np.asarray(ink | ((low != high) & outside))
 
 
 def _without_whiskers(mask: Mask, size: int) -> Mask:

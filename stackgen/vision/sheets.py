@@ -295,7 +295,8 @@ def sheet_ratio(corners: Floats, edge: float) -> float:
     across, down = k2 * two - one, k3 * three - one
     product = across[2] * down[2]
     square = -(across[:2] @ down[:2]) / product if abs(product) > 1e-4 else 0.0
-    focal = np.clip(np.sqrt(square), *FOCALS) if square > 0 else FOCAL
+    seen = np.clip(np.sqrt(square), *FOCALS) if square > 0 else FOCAL
+    focal = np.sqrt(seen * FOCAL)  # corners tell it badly, and most cameras are alike
     lengths = [np.hypot(np.linalg.norm(vector[:2]) / focal, vector[2]) for vector in (across, down)]
     return float(np.clip(lengths[0] / lengths[1], 0.3, 3.3))
 

@@ -16,6 +16,7 @@ from stackgen.vision.cameras import realsense_frame, simulated_frame
 from stackgen.world import PAPER_GRID
 from tests.vision.conftest import CASTLE, camera_that_is_not_there, truth
 
+
 def test_without_the_package_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyrealsense2", None)
     with pytest.raises(StackgenError, match=r"stackgen\[realsense\]"):

@@ -1,0 +1,118 @@
+"""What strokes outline is filled; openings, doorways and windows stay open; lines that enclose nothing go."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from stackgen.errors import StackgenError
+from stackgen.geometry import iou
+from stackgen.vision.outlines import choose, fill
+from stackgen.world import Mask
+
+ARCH = np.array([[100, 100], [400, 100], [400, 400], [300, 400], [300, 200], [200, 200], [200, 400], [100, 400]])
+
+
+def page() -> np.ndarray:
+    return np.zeros((500, 600), dtype=np.uint8)
+
+
+def solid(*outlines: np.ndarray) -> Mask:
+    mask = page()
+    cv2.fillPoly(mask, list(outlines), 1)
+    return mask > 0
+
+
+def drawn(*outlines: np.ndarray, width: int = 5, closed: bool = True) -> Mask:
+    mask = page()
+    cv2.polylines(mask, list(outlines), closed, 1, width)
+    return mask > 0
+
+
+def box(left: int, top: int, right: int, bottom: int) -> np.ndarray:
+    return np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
+
+
+@pytest.mark.parametrize("width", [1, 3, 9, 20, 34])
+def test_outlines_of_any_stroke_are_filled_to_the_middle_of_the_stroke(width: int) -> None:
+    assert iou(fill(drawn(ARCH, width=width)).mask, solid(ARCH)) > 0.96
+
+
+def test_what_is_solid_stays_as_it_is() -> None:
+    assert iou(fill(solid(ARCH)).mask, solid(ARCH)) > 0.99
+
+
+def test_a_gap_is_closed_and_told() -> None:
+    ink = drawn(ARCH)
+    ink[90:110, 240:262] = False
+    found = fill(ink)
+    assert iou(found.mask, solid(ARCH)) > 0.95 and "gap" in " ".join(found.notes)
+
+
+def test_a_missing_base_line_is_drawn_and_told() -> None:
+    open_box = np.array([[100, 400], [100, 100], [400, 100], [400, 400]])
+    found = fill(drawn(open_box, closed=False))
+    assert iou(found.mask, solid(box(100, 100, 400, 400))) > 0.95 and "base line" in " ".join(found.notes)
+
+
+def test_an_open_outline_is_refused() -> None:
+    with pytest.raises(StackgenError, match="outline of the drawing is open"):
+        fill(drawn(np.array([[100, 400], [100, 100], [400, 100]]), closed=False))
+
+
+@pytest.mark.parametrize(
+    ("inner", "stays_open"),
+    [
+        (box(200, 180, 300, 280), True),  # a window: it touches nothing
+        (box(200, 250, 300, 400), True),  # a doorway: on the base line
+        (box(100, 300, 400, 400), False),  # a block under another
+        (box(300, 100, 400, 200), False),  # a block in a corner
+    ],
+    ids=["window", "doorway", "base", "corner"],
+)
+def test_what_is_outlined_within(inner: np.ndarray, stays_open: bool) -> None:
+    found = fill(drawn(box(100, 100, 400, 400), inner))
+    middle = inner.mean(axis=0).astype(int)
+    assert found.mask[middle[1], middle[0]] == (not stays_open)
+    assert found.mask[150, 150]
+
+
+def test_blocks_that_are_drawn_one_by_one_are_filled_and_the_opening_between_them_is_not() -> None:
+    blocks = [box(100, 100, 400, 200), *(box(x, y, x + 100, y + 100) for x in (100, 300) for y in (200, 300))]
+    assert iou(fill(drawn(*blocks)).mask, solid(ARCH)) > 0.96
+
+
+@pytest.mark.parametrize("kind", ["solid", "outline"])
+def test_the_window_of_a_solid_wall_stays_open(kind: str) -> None:
+    wall = solid(box(100, 100, 400, 400)) & ~solid(box(200, 200, 300, 300))
+    ink = wall if kind == "solid" else drawn(box(100, 100, 400, 400), box(200, 200, 300, 300))
+    assert iou(fill(ink).mask, wall) > 0.95
+
+
+@pytest.mark.parametrize("ink", [drawn(ARCH, width=6), solid(ARCH)], ids=["outline", "solid"])
+def test_a_ground_line_is_no_block(ink: Mask) -> None:
+    grounded = ink.copy()
+    grounded[399:405, 20:560] = True
+    found = choose(grounded)
+    assert iou(found.mask, solid(ARCH)) > 0.95 and "ground line" in " ".join(found.notes)
+
+
+def test_name_and_sun_are_left_out_and_told() -> None:
+    ink = drawn(ARCH).astype(np.uint8)
+    cv2.putText(ink, "MIA", (460, 60), cv2.FONT_HERSHEY_SIMPLEX, 1.2, 1, 3)
+    cv2.circle(ink, (520, 150), 40, 1, -1)
+    found = choose(ink > 0)
+    assert iou(found.mask, solid(ARCH)) > 0.95 and "left out" in " ".join(found.notes)
+
+
+def test_of_two_drawings_one_is_asked_for() -> None:
+    left, right = box(50, 200, 200, 400), box(350, 100, 550, 400)
+    ink = drawn(left, right)
+    with pytest.raises(StackgenError, match="2 drawings are in it"):
+        choose(ink)
+    assert iou(choose(ink, which=1).mask, solid(left)) > 0.95
+    assert iou(choose(ink, which=2).mask, solid(right)) > 0.95
+    with pytest.raises(StackgenError, match=r"which must lie in 1\.\.2"):
+        choose(ink, which=3)
+    assert iou(choose(ink, spread=True).mask, solid(left, right)) > 0.95  # both stand on the ground

@@ -1,0 +1,62 @@
+"""The sheet of paper is found where it lies, and seen straight on."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from stackgen.vision.sheets import find_sheet, sheet_ratio, straight_up
+
+CORNERS = np.array([[150, 90], [640, 120], [700, 500], [90, 470]])
+
+
+def photo_with(corners: np.ndarray, paper: int = 235, table: tuple[int, int, int] = (110, 85, 60)) -> np.ndarray:
+    photo = np.full((600, 800, 3), table, dtype=np.uint8)
+    cv2.fillPoly(photo, [corners.astype(np.int32)], (paper, paper, paper - 5))
+    return photo
+
+
+def test_the_sheet_is_found_where_it_lies() -> None:
+    sheet = find_sheet(photo_with(CORNERS))
+    assert sheet is not None and np.abs(sheet.corners - CORNERS).max() < 3
+
+
+@pytest.mark.parametrize("softness", [1.0, 25.0], ids=["hard", "soft"])
+@pytest.mark.parametrize("table", [(110, 85, 60), (60, 62, 66)], ids=["wood", "grey"])
+def test_a_shadow_across_the_sheet_does_no_harm(softness: float, table: tuple[int, int, int]) -> None:
+    shade = np.ones((600, 800), dtype=np.float32)
+    shade[250:, 380:] = 0.45
+    photo = photo_with(CORNERS, table=table) * cv2.GaussianBlur(shade, (0, 0), softness)[..., None]
+    sheet = find_sheet(photo.astype(np.uint8))
+    assert sheet is not None and np.abs(sheet.corners - CORNERS).max() < 6
+
+
+def test_a_corner_may_lie_outside_of_the_photo() -> None:
+    corners = CORNERS + [120, 0]
+    sheet = find_sheet(photo_with(corners))
+    assert sheet is not None and np.abs(sheet.corners - corners).max() < 12
+
+
+def test_without_a_sheet_there_is_none() -> None:
+    assert find_sheet(np.full((600, 800, 3), 230, dtype=np.uint8)) is None
+
+
+def test_a_rectangle_seen_askew_has_its_own_proportions() -> None:
+    corners = np.array([[-1.5, -1], [1.5, -1], [1.5, 1], [-1.5, 1]])
+    lean, turn, focal = np.radians(35), np.radians(20), 600.0
+    corners = corners @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+    points = np.stack([corners[:, 0], corners[:, 1] * np.cos(lean), 6 + corners[:, 1] * np.sin(lean)], axis=1)
+    assert sheet_ratio(focal * points[:, :2] / points[:, 2:], 800.0) == pytest.approx(1.5, rel=0.02)
+
+
+def test_a_drawing_without_a_sheet_is_set_upright_by_its_own_sides() -> None:
+    mask = np.zeros((600, 800), dtype=np.uint8)
+    corners = np.array([[300, 200], [500, 200], [500, 450], [420, 450], [420, 320], [300, 320]]) - [400, 325]
+    turn = np.radians(9)
+    turned = corners @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]] + [400, 325]
+    cv2.fillPoly(mask, [np.round(turned).astype(np.int32)], 1)
+    straight = straight_up(mask > 0)
+    rows = np.flatnonzero(straight.any(axis=1))
+    widths = straight[rows].sum(axis=1)
+    assert widths[3 : len(rows) // 3].std() < 4 and widths[3] == pytest.approx(2.5 * widths[-5], rel=0.06)
