@@ -167,8 +167,23 @@ def explain(error: BaseException) -> str | None:
     # By name: the command line does not import the packages that define them.
     if kinds & {"StackgenError", "ArgumentError", "MisconfigurationException"}:
         return text
+    if _is_refusal(error):
+        return text
     # jsonargparse wraps what goes wrong in a constructor.
     return explain(error.__cause__) if error.__cause__ is not None else None
+
+
+_REFUSING = ("lightning", "pytorch_lightning", "torch", "wandb", "optuna", "fsspec", "tensorboard")
+"""Packages that are handed settings of a user's as they are."""
+
+
+def _is_refusal(error: BaseException) -> bool:
+    """Tell whether a package refused what it was given, by an error that it raised itself and on purpose."""
+    if not isinstance(error, ValueError | TypeError | RuntimeError | ImportError) or error.__traceback__ is None:
+        return False
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    package = last.filename.rpartition("site-packages")[2].replace("\\", "/").strip("/").partition("/")[0]
+    return package in _REFUSING and (last.line or "").startswith("raise ")
 
 
 def usage() -> str:

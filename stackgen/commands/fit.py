@@ -181,6 +181,7 @@ class StackgenCLI(LightningCLI):
         """Make the trainer, which knows what process this is, then the run's folder for its logs and checkpoints."""
         verb, config = str(self.subcommand), self._get(self.config_init, "trainer")
         given: list[Callback] = [config.callbacks] if isinstance(config.callbacks, Callback) else config.callbacks or []
+        _check_trainer(config)
         self.folder: Path | None = None
         curves = verb == "fit" and not in_a_sweep()  # a trial is watched by its sweep alone
         dashboard: Dashboard = self._get(self.config, "dashboard") if curves else "none"
@@ -228,6 +229,17 @@ class StackgenCLI(LightningCLI):
         path = self.folder / "metrics.json"
         write_json(path, {name: float(value) for name, value in self.trainer.callback_metrics.items()})
         print(f"wrote {path}")
+
+
+_LEAST = {"check_val_every_n_epoch": 1, "accumulate_grad_batches": 1, "log_every_n_steps": 0, "gradient_clip_val": 0}
+
+
+def _check_trainer(config: Namespace) -> None:
+    """Refuse numbers that Lightning takes and then divides by."""
+    for name, least in _LEAST.items():
+        value = config.get(name)
+        if value is not None and not value >= least:
+            raise StackgenError(f"trainer.{name} must be at least {least}, got {value}")
 
 
 def _tasks_are_runs() -> bool:

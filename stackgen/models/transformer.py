@@ -43,6 +43,9 @@ class TransformerConfig:
             permutations which one it is.
         self_conditioning: Whether the denoiser is shown its own last estimate of the clean poses too (Chen, Zhang
             & Hinton 2023), so that it keeps to a layout once chosen.
+
+    Raises:
+        StackgenError: If there can be no such network.
     """
 
     width: int = 512
@@ -57,6 +60,15 @@ class TransformerConfig:
     dropout: float = 0.0
     ordered: bool = False
     self_conditioning: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("width", "heads", "feedforward", "patch", "stride"):
+            if getattr(self, name) < 1:
+                raise StackgenError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.width % 2 or self.width % self.heads:
+            raise StackgenError(f"width must be even and a multiple of heads ({self.heads}), got {self.width}")
+        if self.layers < 0 or self.memory_layers < 0 or not 0 <= self.dropout < 1:
+            raise StackgenError("layers and memory_layers must be at least 0, and dropout must lie in [0, 1)")
 
     @property
     def trims(self) -> bool:
