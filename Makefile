@@ -4,9 +4,10 @@
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
-# The first CPython 3.11 that runs; PyBullet has no wheel for later ones. Or: make PYTHON=/path/to/python3.11
-is_311 := import sys; sys.exit(sys.implementation.name != "cpython" or sys.version_info[:2] != (3, 11))
-PYTHON ?= $(shell for p in python3.11 python3 python; do $$p -c '$(is_311)' 2>/dev/null && echo $$p && break; done)
+# The first CPython 3.11 to 3.13 that runs; 3.11 first, which has PyBullet too. Or: make PYTHON=/path/to/python3.12
+fits := import sys; sys.exit(sys.implementation.name != "cpython" or not (3, 11) <= sys.version_info[:2] <= (3, 13))
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
+	$$p -c '$(fits)' 2>/dev/null && echo $$p && break; done)
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2
 
 .PHONY: demo test test-all lint setup clean
@@ -29,7 +30,7 @@ lint: $(STAMP)
 setup: $(STAMP)
 
 $(STAMP): setup.cfg pyproject.toml constraints.txt
-	@test -n "$(PYTHON)" || { echo "stackgen needs CPython 3.11: install it, or make PYTHON=/path/to/python3.11" >&2; exit 2; }
+	@test -n "$(PYTHON)" || { echo "stackgen needs CPython 3.11 to 3.13: install one, or make PYTHON=/path/to/python3.12" >&2; exit 2; }
 	$(PYTHON) -m venv $(VENV)
 	@# torch first and pinned: what comes after then finds it there and pulls nothing else in.
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch

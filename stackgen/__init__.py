@@ -8,7 +8,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import lazy_loader
 
@@ -19,6 +19,18 @@ if TYPE_CHECKING:
 
 __all__ = ["Model", "Stack", "StackgenError", "best", "load", "sample"]
 
-__getattr__, __dir__, _ = lazy_loader.attach(
+_attribute, _, _ = lazy_loader.attach(
     __name__, submod_attrs={"api": ["Model", "best", "load", "sample"], "errors": ["StackgenError"], "stack": ["Stack"]}
 )
+
+
+def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("stackgen")
+    return _attribute(name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]
