@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from stackgen.commands.generate import COMMAND as GENERATE
+from stackgen.data.dataset import Dataset
 from stackgen.data.generation.generate import GenerateSettings
 from stackgen.evaluation.metrics import METRICS, SampleScore, SceneScore
 from stackgen.models.weights import last_checkpoint
@@ -86,3 +87,20 @@ def test_a_shape_of_one_s_own_is_data(tmp_path: Path) -> None:
     assert settings.catalogue.names[-1] == "trapezoid" == content["template"]["top_row_only"][0]
     assert settings.catalogue[-1].volume == pytest.approx(0.75)
     assert np.ptp(np.array(settings.catalogue[-1].outline)[:, 0]) == 1
+
+
+def test_a_shape_of_one_s_own_is_generated_and_repaired(cli: Cli, tmp_path: Path) -> None:
+    """Settings are checked against their own catalogue, wherever they are written down and read back."""
+    out = tmp_path / "trapezoids"
+    words = ["--stacks", 6, "--templates_per_shard", 1, "--workers", 1, "--out", out]
+    answer = cli("generate", "--config", EXAMPLES / "shape.yaml", *words)
+    assert answer.code == 0, answer.err
+    dataset = Dataset.open(out)
+    settings = GenerateSettings.from_manifest(dataset.manifest)
+    assert settings.template.top_row_only == ("trapezoid",) and settings.world == dataset.world
+    victim = out / dataset.manifest.shards[0]["file"]
+    whole = victim.read_bytes()
+    victim.unlink()
+    answer = cli("dataset", "repair", out, "--workers", 1)
+    assert answer.code == 0 and victim.read_bytes() == whole
+    assert cli("dataset", "verify", out).code == 0
