@@ -175,8 +175,8 @@ def _quadrangle(region: Mask) -> Floats | None:
     area = float(cv2.contourArea(hull))
     if not LEAST_SHEET * region.size <= area <= 0.985 * region.size or cv2.contourArea(contour) < 0.8 * area:
         return None
-    around = cv2.approxPolyDP(hull, 0.015 * cv2.arcLength(hull, True), True)[:, 0].astype(np.float64)
-    if not 4 <= len(around) <= 8:
+    around = cv2.approxPolyDP(hull, 0.006 * cv2.arcLength(hull, True), True)[:, 0].astype(np.float64)
+    if not 4 <= len(around) <= 10:
         return None
     lines = _four_sides(around, region.shape)
     if lines is None:

@@ -10,9 +10,9 @@ import pytest
 
 from stackgen.errors import StackgenError
 from stackgen.geometry import iou
+from stackgen.vision.cameras import realsense_frame, simulated_frame
 from stackgen.vision.depth import find_structure
 from stackgen.vision.masks import fitted
-from stackgen.vision.cameras import realsense_frame, simulated_frame
 from stackgen.world import PAPER_GRID
 from tests.vision.conftest import CASTLE, camera_that_is_not_there, truth
 
