@@ -11,6 +11,8 @@ from typing import Any, Literal
 
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_json
+from stackgen.io.schemas import require_valid
+from stackgen.io.text import decode_text, parse_json, read_json
 from stackgen.world import World
 
 FORMAT = "stackgen.dataset/1"
@@ -19,8 +21,9 @@ SPLITS: tuple[Split, ...] = ("train", "validation", "test")
 ShardEntry = dict[str, Any]
 """What a manifest says of a shard: `file`, `split`, `samples` and `sha256`."""
 
+_SCHEMA = Path(__file__).with_name("dataset.schema.json")
 _GOLDEN = 0.6180339887498949
-_SHARD_NAME = re.compile(rf"(?:{'|'.join(SPLITS)})-(\d+)\.tar")
+_SHARD_NAME = re.compile(rf"(?:{'|'.join(SPLITS)})-([0-9]{{1,12}})\.tar")
 
 
 def split_of(number: int, validation: float, test: float, offset: float = 0.0) -> Split:
@@ -98,11 +101,7 @@ class Manifest:
         Raises:
             StackgenError: If it is not a manifest of this format.
         """
-        try:
-            data = json.loads(content)
-        except ValueError as error:
-            raise StackgenError(f"{path} is not readable as JSON: {error}") from error
-        return Manifest.from_json(data, path)
+        return Manifest.from_json(parse_json(decode_text(content, path), path), path)
 
     @staticmethod
     def from_json(data: Any, path: str | Path = "manifest") -> Manifest:
@@ -114,10 +113,11 @@ class Manifest:
         if not isinstance(data, dict) or data.get("format") != FORMAT:
             raise StackgenError(f"{path} is not a {FORMAT} manifest")
         try:
-            world, shards = World.from_json(data), tuple(data["shards"])
-            return Manifest(data["name"], data["seed"], world, data["physics"], data["settings"], shards)
-        except (KeyError, TypeError, StackgenError) as error:
-            raise StackgenError(f"{path} is damaged: {error!r}") from error
+            require_valid(data, _SCHEMA)
+            world = World.from_json(data)
+        except StackgenError as error:
+            raise StackgenError(f"{path} is damaged: {error}") from error
+        return Manifest(data["name"], data["seed"], world, data["physics"], data["settings"], tuple(data["shards"]))
 
 
 def shard_entry(name: str, content: bytes, samples: int) -> ShardEntry:
@@ -128,6 +128,18 @@ def shard_entry(name: str, content: bytes, samples: int) -> ShardEntry:
     """
     sha256 = hashlib.sha256(content).hexdigest()
     return {"file": name, "split": name.rpartition("-")[0], "samples": samples, "sha256": sha256}
+
+
+def read_shard_entry(path: Path) -> ShardEntry:
+    """Read the description of one shard from a file of its own.
+
+    Raises:
+        StackgenError: If it is none, or names what is not the plain name of a shard.
+    """
+    entry = read_json(path)
+    require_valid(entry, _SCHEMA, "shard")
+    shard_number(entry["file"])
+    return entry
 
 
 def shard_number(name: str) -> int:
@@ -143,3 +155,8 @@ def shard_number(name: str) -> int:
     if match is None:
         raise StackgenError(f"{name!r} is not the name of a shard: they are called SPLIT-NUMBER.tar")
     return int(match[1])
+
+
+def is_shard_name(name: str) -> bool:
+    """Tell whether the generator calls its shards so."""
+    return _SHARD_NAME.fullmatch(name) is not None

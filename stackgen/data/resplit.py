@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import math
+import secrets
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -18,6 +21,7 @@ from stackgen.data.manifest import SPLITS, Manifest, Split, split_of
 from stackgen.data.shards import Sample, write_shard
 from stackgen.data.sources import Shard
 from stackgen.errors import StackgenError
+from stackgen.io.files import held
 from stackgen.world import World
 
 By = Literal["template", "layout"]
@@ -64,19 +68,37 @@ def resplit(folder: Path, out: Path, how: Resplit, progress: Callable[[int], Non
     manifest = read_manifest(folder)
     if out.exists():
         raise StackgenError(f"{out} is there already: choose another folder")
-    workshop = out.with_name(f".{out.name}.unfinished")
-    shutil.rmtree(workshop, ignore_errors=True)  # of a run that was killed
+    for left in out.parent.glob(f".{glob.escape(out.name)}.*.unfinished"):  # by runs that were killed
+        with contextlib.suppress(StackgenError, OSError), held(left):
+            shutil.rmtree(left)
+    workshop = out.with_name(f".{out.name}.{secrets.token_hex(4)}.unfinished")
     workshop.mkdir(parents=True)
     try:
-        entries = _write(folder, workshop, manifest, how, progress or (lambda read: None))
-        settings = {**manifest.settings, "resplit": {**vars(how), "source": manifest.sha256}}
-        result = replace(manifest, settings=settings, shards=tuple(entries))
-        write_card(workshop, result)
-        result.save(workshop)
-        workshop.rename(out)
+        with held(workshop):
+            result = _written(folder, workshop, manifest, how, progress or (lambda read: None))
+            _put_in_place(workshop, out)
     except BaseException:
         shutil.rmtree(workshop, ignore_errors=True)
         raise
+    return result
+
+
+def _put_in_place(workshop: Path, out: Path) -> None:
+    try:
+        workshop.rename(out)
+    except OSError as error:  # another command was faster
+        raise StackgenError(f"{out} is there already: choose another folder") from error
+
+
+def _written(
+    folder: Path, workshop: Path, manifest: Manifest, how: Resplit, progress: Callable[[int], None]
+) -> Manifest:
+    """Write the whole new dataset, and give its manifest."""
+    entries = _write(folder, workshop, manifest, how, progress)
+    settings = {**manifest.settings, "resplit": {**vars(how), "source": manifest.sha256}}
+    result = replace(manifest, settings=settings, shards=tuple(entries))
+    write_card(workshop, result)
+    result.save(workshop)
     return result
 
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
+import re
 import secrets
 import shutil
 import tempfile
@@ -38,6 +40,42 @@ def write_atomically(path: str | Path, data: bytes | memoryview) -> None:
             raise
     except OSError as error:
         raise StackgenError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+_LEFT_OVER = re.compile(r"\..+\.[0-9a-f]{8}\.tmp")
+
+
+def is_left_over(name: str) -> bool:
+    """Tell whether a file's name is one that a killed :func:`write_atomically` leaves behind.
+
+    >>> is_left_over(".train-000000.tar.0123abcd.tmp"), is_left_over("notes.tmp")
+    (True, False)
+    """
+    return _LEFT_OVER.fullmatch(name) is not None
+
+
+@contextlib.contextmanager
+def held(folder: Path, shared: bool = False) -> Iterator[None]:
+    """Keep a folder from other commands as long as the block runs; nothing is left behind, even by a kill.
+
+    Args:
+        folder: The folder.
+        shared: Whether others may hold it, too, if they share it.
+
+    Raises:
+        StackgenError: If another command holds it.
+    """
+    number = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(number, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise StackgenError(f"another command is at work in {folder}: wait until it has ended") from None
+        except OSError:
+            pass  # some file systems of networks have no locks of folders
+        yield
+    finally:
+        os.close(number)
 
 
 def _flush_folder(folder: Path) -> None:

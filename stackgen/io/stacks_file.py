@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
+from stackgen.io.schemas import require_valid
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
 from stackgen.world import PAPER_WORLD, Catalogue, Grid, Mask, World
@@ -255,23 +256,7 @@ def _validate(data: Any) -> None:
         raise StackgenError("is not a stacks file; it begins with " + _BEGINNING)
     if data["format"] != FORMAT:
         raise StackgenError(f"$.format is {_short(data['format'])}; this version reads {FORMAT!r}")
-    import jsonschema
-
-    error = jsonschema.exceptions.best_match(jsonschema.Draft202012Validator(schema()).iter_errors(data))
-    if error is not None:
-        raise StackgenError(f"{error.json_path}: {_short_message(error)}")
-
-
-def _short_message(error: Any) -> str:
-    """Say what a schema error says, without quoting half of the file."""
-    message = " ".join(error.message.split())
-    quoted = repr(error.instance)
-    if len(quoted) > 60:
-        message = message.replace(quoted, quoted[:50] + "...", 1)
-    limits = {"minItems": "at least", "maxItems": "at most"}
-    if error.validator in limits:
-        return f"has {len(error.instance)} items; {limits[error.validator]} {error.validator_value} are possible"
-    return message if len(message) <= 220 else message[:220] + "..."
+    require_valid(data, SCHEMA_PATH)
 
 
 def _short(value: Any) -> str:

@@ -6,6 +6,7 @@ import hashlib
 from collections import Counter
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -117,3 +118,31 @@ def test_splitting_from_the_command_line(families: Path, tmp_path: Path, cli: Cl
     for arguments in (["--out", tmp_path / "y"], ["--test", 0.2]):
         answer = cli("dataset", "split", families, *arguments)
         assert answer.code == 2 and "--out and one of --validation and --test" in answer.line
+
+
+def test_two_splits_into_one_folder_leave_one_whole_dataset(
+    families: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, write, nested = tmp_path / "new", module._write, iter([True])
+
+    def meeting(*arguments: Any) -> Any:
+        if next(nested, False):
+            resplit(families, out, Resplit(0.1, 0.1))
+        return write(*arguments)
+
+    monkeypatch.setattr(module, "_write", meeting)
+    with pytest.raises(StackgenError, match="is there already"):
+        resplit(families, out, Resplit(0.3, 0.3))
+    assert verify(out) == []
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["families", "new"]
+
+
+def test_what_a_killed_split_left_is_removed_and_no_link_is_followed(families: Path, tmp_path: Path) -> None:
+    (tmp_path / ".new.0123abcd.unfinished").mkdir()
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "file").touch()
+    (tmp_path / ".new.01234567.unfinished").symlink_to(tmp_path / "precious")
+    (tmp_path / ".new.unfinished").symlink_to(tmp_path / "precious")
+    resplit(families, tmp_path / "new", Resplit(0.1, 0.1))
+    assert verify(tmp_path / "new") == [] and (tmp_path / "precious" / "file").exists()
+    assert not (tmp_path / ".new.0123abcd.unfinished").exists()

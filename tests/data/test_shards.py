@@ -161,7 +161,7 @@ def test_the_manifest_s_hash_names_every_shard_s(dataset: Path) -> None:
     ("text", "message"),
     [
         (None, "no dataset at"),
-        ("{", "not readable as JSON"),
+        ("{", "not JSON"),
         ("[]", "not a stackgen.dataset/1 manifest"),
         ('{"format": "other"}', "not a stackgen.dataset/1 manifest"),
         ('{"format": "stackgen.dataset/1"}', "damaged"),

@@ -124,7 +124,7 @@ def test_a_compact_file_may_lie_elsewhere_too(dataset: Path, splits: dict[str, S
         ("file:///nowhere.npz", "no file|No such file"),
         ("strange://host/data", "strange"),
         ("pipe:cat /nowhere/{file}", r"`cat /nowhere/dataset.json` ended with exit code 1"),
-        ("pipe:echo {file}", "not readable as JSON"),
+        ("pipe:echo {file}", "not JSON"),
         ("pipe:true", "not a compact stackgen dataset"),
         ("s3://bucket/data", "s3"),
     ],

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from functools import cache, partial
 from itertools import count
 from pathlib import Path
@@ -28,7 +28,7 @@ from stackgen.data.generation.workshop import PARTS, MadeShard, Workshop, claim,
 from stackgen.data.manifest import Manifest, ShardEntry, Split, shard_entry, split_of
 from stackgen.data.shards import Sample, encode_shard, read_shard
 from stackgen.errors import StackgenError
-from stackgen.io.files import write_atomically
+from stackgen.io.files import held, write_atomically
 from stackgen.sim.checkers import AcceptLimits
 from stackgen.sim.physics import Physics
 from stackgen.sim.simulator import Simulator
@@ -106,9 +106,9 @@ class GenerateSettings:
 
     def to_json(self) -> dict[str, Any]:
         """Give the plain form without what the manifest stores elsewhere."""
-        plain = asdict(replace(self, catalogue=PAPER_CATALOGUE))
-        for key in ("name", "seed", "grid", "catalogue", "physics", "max_blocks"):
-            plain.pop(key)
+        elsewhere = ("name", "seed", "grid", "catalogue", "physics", "max_blocks")
+        own = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in elsewhere}
+        plain = {n: asdict(v) if is_dataclass(v) and not isinstance(v, type) else v for n, v in own.items()}
         return {"revision": REVISION, **json.loads(json.dumps(plain))}
 
     @staticmethod
@@ -165,9 +165,8 @@ def generate(
         StackgenError: If the folder holds something else, a shard was damaged since the dataset was
             complete, the disk is full, or workers die again and again.
     """
-    with disk_may_be_full(out):
-        claim(out, _manifest(settings, ()).to_json(), partial(_are, settings))
-        manifest = finished(out)
+    with disk_may_be_full(out), _claimed(settings, out):
+        manifest = finished(out, settings.draw or settings.stacks)
         if manifest is None:
             workshop = workshop_of(settings, out)
             executor = executor or make_executor("local", workers)
@@ -203,9 +202,8 @@ def generate_range(
     Returns:
         The number of stacks they hold; 0 if the dataset is complete already.
     """
-    with disk_may_be_full(out):
-        claim(out, _manifest(settings, ()).to_json(), partial(_are, settings))
-        if finished(out) is not None:
+    with disk_may_be_full(out), _claimed(settings, out, shared=True):
+        if finished(out, settings.draw or settings.stacks) is not None:
             return 0
         workshop = workshop_of(settings, out)
         known = workshop.whole(say or _ignore, shards)
@@ -340,6 +338,15 @@ def make_shards(
                 )
     entries[-1] = workshop.trim(entries[-1], entries[-1]["samples"] - (stored - settings.stacks))
     return entries
+
+
+@contextlib.contextmanager
+def _claimed(settings: GenerateSettings, out: Path, shared: bool = False) -> Iterator[None]:
+    """Have the folder to oneself, or share it with others who make a range of the same shards."""
+    out.mkdir(parents=True, exist_ok=True)
+    with held(out, shared):
+        claim(out, _manifest(settings, ()).to_json(), partial(_are, settings))
+        yield
 
 
 def workshop_of(settings: GenerateSettings, out: Path) -> Workshop:

@@ -17,7 +17,7 @@ from stackgen.data.generation.workshop import PARTS, MadeShard, Workshop, disk_m
 from stackgen.data.manifest import Manifest, ShardEntry, shard_entry, shard_number
 from stackgen.data.shards import encode_shard, is_whole, iterate_shard
 from stackgen.errors import StackgenError
-from stackgen.io.files import write_atomically
+from stackgen.io.files import held, write_atomically
 from stackgen.sim.physics import Physics, engine_version
 
 
@@ -64,7 +64,7 @@ def repair(
     settings = _settings(manifest, other_bytes)
     identical: list[MadeShard] = []
     other: list[MadeShard] = []
-    with disk_may_be_full(folder):
+    with disk_may_be_full(folder), held(folder):
         made = _made(folder, manifest, settings, list(lost), executor or make_executor("local"))
         for done, (number, shard) in enumerate(made, 1):
             entry = lost[number]

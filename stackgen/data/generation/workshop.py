@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from stackgen.data.dataset import read_manifest
-from stackgen.data.manifest import Manifest, ShardEntry, shard_entry
+from stackgen.data.manifest import Manifest, ShardEntry, is_shard_name, read_shard_entry, shard_entry, shard_number
 from stackgen.data.shards import encode_shard, is_whole, read_shard
 from stackgen.errors import StackgenError
-from stackgen.io.files import write_atomically
+from stackgen.io.files import is_left_over, write_atomically
 
 PROGRESS, PARTS = "progress", "parts"
 """Folders within a dataset that is not complete yet: the record of whole shards, and what is drawn from."""
@@ -62,12 +62,14 @@ class Workshop:
             if only is not None and record.stem.isdigit() and int(record.stem) not in only:
                 continue
             try:
-                entry = json.loads(record.read_text())
+                entry = read_shard_entry(record)
+                if record.stem != f"{shard_number(entry['file']):06d}":
+                    raise StackgenError("it is of another shard")
                 if is_whole(self.folder / entry["file"], entry["sha256"]):
-                    found[int(record.stem)] = entry
+                    found[shard_number(entry["file"])] = entry
                 else:
                     say(f"{self.folder / entry['file']} is missing or damaged: it is made again")
-            except (ValueError, KeyError, TypeError):
+            except StackgenError:
                 say(f"{record} is damaged: its shard is made again")
         return found
 
@@ -121,15 +123,24 @@ def _json(text: str) -> Any:
         return None
 
 
-def finished(out: Path) -> Manifest | None:
+def finished(out: Path, stacks: int) -> Manifest | None:
     """Give the manifest of a dataset that is complete, None if it is still to be made.
 
+    Args:
+        out: Folder of the dataset.
+        stacks: Number of stacks that it holds when it is complete.
+
     Raises:
-        StackgenError: If it was complete once, but a shard is missing or damaged.
+        StackgenError: If it was complete once, but its manifest is not whole, or a shard is missing or damaged.
     """
     if not (out / "dataset.json").exists():
         return None
     manifest = read_manifest(out)
+    if (listed := sum(manifest.counts.values())) != stacks:
+        raise StackgenError(
+            f"{out / 'dataset.json'} lists {listed} of the {stacks} stacks: it is not as it was written, and nothing"
+            " was changed; put it back, or move it away to have it made again"
+        )
     lost = [entry["file"] for entry in manifest.shards if not is_whole(out / entry["file"], entry["sha256"])]
     if lost:
         more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
@@ -145,8 +156,8 @@ def sweep(out: Path, manifest: Manifest) -> None:
     for folder in (out / PARTS, out / PROGRESS):
         shutil.rmtree(folder, ignore_errors=True)
     known = {entry["file"] for entry in manifest.shards}
-    for path in [*out.glob("*.tar"), *out.glob(".*.tmp")]:
-        if path.name not in known:
+    for path in out.iterdir():
+        if (is_shard_name(path.name) and path.name not in known) or is_left_over(path.name):
             path.unlink(missing_ok=True)
 
 

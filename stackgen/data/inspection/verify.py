@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from stackgen.data.decoding import Decoded, decode_shard
 from stackgen.data.generation.workshop import PARTS, PROGRESS
 from stackgen.data.manifest import Manifest, ShardEntry
 from stackgen.data.shards import compression_of
+from stackgen.io.text import read_json
 
 Fault = Literal["missing", "truncated", "altered", "unreadable", "wrong", "foreign"]
 _END = 1024  # zero bytes at least at the end of a tar
@@ -76,7 +76,7 @@ class _Seen:
 
 def _of_manifest(folder: Path, manifest: Manifest) -> list[Problem]:
     problems = []
-    counts = json.loads((folder / "dataset.json").read_bytes()).get("counts")
+    counts = read_json(folder / "dataset.json").get("counts")
     if counts != manifest.counts:
         problems.append(Problem("dataset.json", "wrong", "its counts are not the sums of its shards'"))
     files = [entry["file"] for entry in manifest.shards]
@@ -86,8 +86,6 @@ def _of_manifest(folder: Path, manifest: Manifest) -> list[Problem]:
 
 def _of_shard(folder: Path, manifest: Manifest, entry: ShardEntry, seen: _Seen) -> list[Problem]:
     name = entry["file"]
-    if Path(name).name != name:
-        return [Problem("dataset.json", "wrong", f"it names a file {name!r} outside of the folder")]
     try:
         content = (folder / name).read_bytes()
     except FileNotFoundError:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,13 @@ import pytest
 from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.data.generation import generate as module
 from stackgen.data.generation.designs import Design, DesignSettings
-from stackgen.data.generation.generate import GenerateSettings, generate, template_samples, testset_designs
+from stackgen.data.generation.generate import (
+    GenerateSettings,
+    generate,
+    generate_range,
+    template_samples,
+    testset_designs,
+)
 from stackgen.data.generation.workshop import MadeShard
 from stackgen.data.manifest import SPLITS, Manifest
 from stackgen.data.shards import Sample, read_shard
@@ -308,3 +315,83 @@ def test_executors_and_workers_that_do_not_exist_are_one_line(tmp_path: Path, cl
     assert "ray" in cli("generate", *SMALL_OPTIONS, *out, "--executor", "cloud").line
     assert "at least 1" in cli("generate", *SMALL_OPTIONS, *out, "--workers", 0).line
     assert not (tmp_path / "x").exists()
+
+
+# Hostile and damaged records; two commands in one folder.
+
+
+@pytest.mark.parametrize("file", ["../outside/train-000000.tar", "/etc/passwd", "train-000001.tar", "x.tar", 5, None])
+def test_a_record_that_names_another_file_is_not_believed(
+    file: object, small: Path, shards: dict[int, MadeShard], tmp_path: Path
+) -> None:
+    out = copy(small, tmp_path / "copy")
+    (out / "dataset.json").unlink()
+    outside = copy(small, tmp_path / "outside")
+    victim = next(outside.glob("*.tar"))
+    victim = victim.rename(outside / "train-000000.tar")
+    entry = {
+        "file": file,
+        "split": "train",
+        "samples": 10**9,
+        "sha256": hashlib.sha256(victim.read_bytes()).hexdigest(),
+    }
+    (out / "progress").mkdir()
+    (out / "progress" / "000000.json").write_text(json.dumps(entry))
+    before = contents(outside)
+    told: list[str] = []
+    generate(SMALL, out, executor=Stored(shards), say=told.append)
+    assert contents(out) == contents(small) and contents(outside) == before
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize("cut", [0, 100, 2])
+def test_a_cut_manifest_costs_no_shard(cut: int, small: Path, tmp_path: Path) -> None:
+    out = copy(small, tmp_path / "copy")
+    path = out / "dataset.json"
+    if cut == 2:
+        path.write_text(json.dumps({**json.loads(path.read_text()), "shards": []}))
+    else:
+        path.write_bytes(path.read_bytes()[:cut])
+    before = contents(out)
+    for _ in range(2):
+        with pytest.raises(StackgenError, match=r"dataset\.json"):
+            generate(SMALL, out, executor=Stored({}))
+    assert contents(out) == before
+
+
+def test_files_of_others_in_the_folder_stay(small: Path, tmp_path: Path) -> None:
+    out = copy(small, tmp_path / "copy")
+    for name in ("backup.tar", "train-notes.tar", ".notes.tmp"):
+        (out / name).touch()
+    (out / "train-000777.tar").touch()
+    generate(SMALL, out, executor=Stored({}))
+    assert {"backup.tar", "train-notes.tar", ".notes.tmp"} <= {path.name for path in out.iterdir()}
+    assert not (out / "train-000777.tar").exists()
+
+
+def test_two_commands_do_not_meet_in_one_folder(small: Path, shards: dict[int, MadeShard], tmp_path: Path) -> None:
+    out = tmp_path / "both"
+
+    class Meeting(Stored):
+        def map(self, task: Any, numbers: Any) -> Any:
+            with pytest.raises(StackgenError, match="another command is at work"):
+                generate(SMALL, out, executor=Stored(shards))
+            with pytest.raises(StackgenError, match="another command is at work"):
+                generate_range(SMALL, out, range(2), Stored(shards))
+            yield from super().map(task, numbers)
+
+    generate(SMALL, out, executor=Meeting(shards))
+    assert contents(out) == contents(small)
+
+
+def test_jobs_that_make_ranges_share_a_folder(small: Path, shards: dict[int, MadeShard], tmp_path: Path) -> None:
+    out = tmp_path / "shared"
+
+    class Meeting(Stored):
+        def map(self, task: Any, numbers: Any) -> Any:
+            generate_range(SMALL, out, range(2, 4), Stored(shards))
+            yield from super().map(task, numbers)
+
+    generate_range(SMALL, out, range(2), Meeting(shards))
+    generate(SMALL, out, executor=Stored(shards))
+    assert contents(out) == contents(small)
