@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -24,6 +25,19 @@ from stackgen.world import PAPER_WORLD, Mask
 
 settings.register_profile("patient", deadline=None)  # on a busy machine the slowest example says nothing
 settings.load_profile("patient")
+
+
+OF_BULLET = ("tests/robot", "tests/commands/test_build.py")
+"""Tests of the simulated arm, which lives in PyBullet."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip the tests of the arm where PyBullet is missing."""
+    if find_spec("pybullet"):
+        return
+    for item in items:
+        if item.nodeid.startswith(OF_BULLET):
+            item.add_marker(pytest.mark.skip(reason="needs PyBullet, which has wheels for CPython 3.11"))
 
 
 class Answer(NamedTuple):

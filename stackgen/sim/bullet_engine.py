@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stackgen.errors import StackgenError
 from stackgen.sim.physics import Physics, unit_inertia
 from stackgen.world import Shape
 
@@ -37,8 +38,22 @@ def _quiet() -> Iterator[None]:
         os.close(null)
 
 
-with _quiet():
-    import pybullet as bullet
+class _Bullet:
+    """PyBullet, imported when something of it is first asked for: what only plans, or prints a help, does without."""
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            with _quiet():
+                import pybullet
+        except ModuleNotFoundError as error:
+            raise StackgenError(
+                "this needs PyBullet, which has wheels for CPython 3.11: use that, or build it by pip install pybullet"
+            ) from error
+        self.__dict__.update(vars(pybullet))
+        return getattr(pybullet, name)
+
+
+bullet: Any = _Bullet()
 
 
 class BulletEngine:
@@ -86,9 +101,9 @@ class BulletEngine:
         bullet.disconnect(self.number)
 
 
-def connect(physics: Physics, mode: int = bullet.DIRECT) -> int:
-    """Open a client of PyBullet with gravity, ground and the solver's settings; return its number."""
-    client = bullet.connect(mode)
+def connect(physics: Physics, mode: int | None = None) -> int:
+    """Open a client of PyBullet with gravity, ground and the solver's settings, by default without a window."""
+    client = bullet.connect(bullet.DIRECT if mode is None else mode)
     bullet.setGravity(0, 0, -physics.gravity, physicsClientId=client)
     bullet.setPhysicsEngineParameter(
         fixedTimeStep=physics.time_step,
@@ -101,7 +116,7 @@ def connect(physics: Physics, mode: int = bullet.DIRECT) -> int:
     plane = bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=client)
     ground = bullet.createMultiBody(0, plane, physicsClientId=client)
     bullet.changeDynamics(ground, -1, lateralFriction=physics.friction**0.5, physicsClientId=client)
-    return client
+    return int(client)
 
 
 @dataclass(frozen=True)

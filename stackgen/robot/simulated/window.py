@@ -27,7 +27,8 @@ class Window(Connected):
         StackgenError: If there is no display to open one on.
     """
 
-    def __init__(self, arm: SimulatedArm, mode: int = bullet.GUI) -> None:
+    def __init__(self, arm: SimulatedArm, mode: int | None = None) -> None:
+        mode = bullet.GUI if mode is None else mode
         if mode == bullet.GUI:
             require_display()
         super().__init__(connect(arm.physics, mode))
