@@ -16,6 +16,7 @@ from stackgen.commands.verdict_table import FALLS, STANDS, verdict_facts, verdic
 from stackgen.io.stacks_file import StackEntry, read_stacks, write_stacks
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
+from stackgen.sim.statics.fit import describe_misfits
 
 
 def main(
@@ -24,7 +25,9 @@ def main(
     explain: bool = False,
     physics: Physics = Physics(),  # noqa: B008 - it is frozen
 ) -> int:
-    """Simulate the structures of a stacks file and say which stand; the exit code is 1 if any falls.
+    """Simulate the structures of a stacks file and say which stand.
+
+    The exit code is 1 if any falls, or has blocks inside each other or in the ground.
 
     Args:
         file: File of stacks (stacks.json), made by stackgen or written by hand; `-` is standard input.
@@ -33,7 +36,9 @@ def main(
         physics: Numbers of the simulation; what is not given is as in the file, as far as it describes the blocks.
     """
     content = read_stacks(file)
-    physics = replace(Physics.recorded(content.physics, physics), cell_size=content.cell_size)
+    physics = Physics.recorded({**(content.physics or {}), "cell_size": content.cell_size}, physics)
+    content = replace(content, cell_size=physics.cell_size)
+    misfits = [describe_misfits(entry.stack) for entry in content.entries]
     checker = SimulatorChecker(physics)
     entries = tuple(
         replace(check(checker, entry.stack, content.target, content.world.grid), comment=entry.comment)
@@ -43,11 +48,16 @@ def main(
     if explain:
         entries, statics = _explained(entries, physics)
         tell("", statics)
-    tell(physics=physics.to_json(), stacks=[verdict_facts(entry) for entry in entries])
+    for number, those in enumerate(misfits, 1):
+        tell(*(f"stack {number}: {misfit.text}" for misfit in those))
+    told = zip(entries, misfits, strict=True)
+    facts = [{**verdict_facts(entry), "misfits": [misfit.text for misfit in those]} for entry, those in told]
+    tell(physics=physics.to_json(), stacks=facts)
     if out is not None:
         write_stacks(out, replace(content, entries=entries, physics=physics.to_json()))
         wrote(out)
-    return 0 if all(entry.verdict and entry.verdict.stable for entry in entries) else 1
+    impossible = any(misfit.impossible for those in misfits for misfit in those)
+    return 0 if not impossible and all(entry.verdict and entry.verdict.stable for entry in entries) else 1
 
 
 def _explained(entries: Sequence[StackEntry], physics: Physics) -> tuple[tuple[StackEntry, ...], Table]:

@@ -45,7 +45,8 @@ class Physics:
 
     Args:
         engine: Engine that simulates, `bullet` or `mujoco`; by default Bullet where it is installed.
-        cell_size: Edge of a cube [m].
+        cell_size: Edge of a cube [m]. Stacks are simulated at one scale, that of the default: whether rigid blocks
+            stand does not depend on it.
         friction: Coulomb coefficient between any two surfaces.
         density: Density of every block [kg/m^3].
         gravity: Acceleration of gravity [m/s^2].

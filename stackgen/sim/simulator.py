@@ -8,7 +8,7 @@ rollout depends on the stack alone: not on what was simulated before, nor on the
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Protocol
 
@@ -95,6 +95,7 @@ class Simulator:
 
     def __init__(self, physics: Physics | None = None) -> None:
         self.physics = physics or Physics()
+        self._scaled = replace(self.physics, cell_size=Physics.cell_size)
         self._engine: Engine | None = None
 
     def rollout(
@@ -109,10 +110,10 @@ class Simulator:
             record_every: Keep every n-th step's poses in the trajectory; 0 keeps none.
         """
         if self._engine is None:
-            self._engine = open_engine(self.physics)
+            self._engine = open_engine(self._scaled)
         order = np.lexsort((*stack.poses.T, stack.shapes))  # the order of the blocks must not matter
         shapes = [stack.catalogue[shape] for shape in stack.shapes[order]]
-        watch = _Watch(self._engine, self.physics, shapes, stack.poses[order])
+        watch = _Watch(self._engine, self._scaled, shapes, stack.poses[order])
         poses, at_rest, steps, frames = watch.run(until_fall, until_moved, record_every)
         back = np.argsort(order)
         trajectory = np.array([frame[back] for frame in frames]) if record_every else None

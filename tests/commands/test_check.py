@@ -24,3 +24,47 @@ def test_check_explains(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     margins = [entry.verdict and entry.verdict.margin for entry in read_stacks(checked).entries]
     assert margins == pytest.approx([math.atan(0.5), 0.0], abs=1e-3)
     assert "statics" not in cli("check", file).out
+
+
+@pytest.mark.parametrize(
+    ("blocks", "words"),
+    [
+        ([("cube", 0, 0.5), ("cube", 0, 0.5)], "block 0 (cube) and block 1 (cube) are 1.00 cells inside each other"),
+        ([("cube", 0, -3)], "block 0 (cube) is 3.50 cells in the ground"),
+        ([("cube", 0, 0.5), ("cube", 0, 1.2)], "block 0 (cube) and block 1 (cube) are 0.30 cells inside each other"),
+    ],
+)
+def test_what_cannot_be_is_said_and_does_not_pass(
+    blocks: list[tuple[str, float, float]], words: str, cli: Cli, tmp_path: Path
+) -> None:
+    file = tmp_path / "stacks.json"
+    file.write_text(json.dumps(stacks_json([("cube", 0, 0.5)], blocks)))
+    answer = cli("check", file)
+    assert answer.code == 1 and f"stack 2: {words}" in answer.out and "stack 1:" not in answer.out
+    facts = json.loads(cli("check", file, "--json").out)
+    assert [entry["misfits"] for entry in facts["stacks"]] == [[], [words]]
+
+
+def test_a_block_in_the_air_is_said(cli: Cli, tmp_path: Path) -> None:
+    file = tmp_path / "stacks.json"
+    file.write_text(json.dumps(stacks_json([("cube", 0, 0.8)])))
+    answer = cli("check", file)
+    assert answer.code == 0 and "block 0 (cube) floats 0.30 cells above what is below it" in answer.out
+
+
+@pytest.mark.parametrize("size", [0.0005, 0.02, 10.0])
+def test_verdicts_do_not_depend_on_the_scale(size: float, cli: Cli, tmp_path: Path) -> None:
+    file, out, again = tmp_path / "stacks.json", tmp_path / "out.json", tmp_path / "again.json"
+    half = [("cube", -1.5, 0.5), ("cube", -1.5, 1.5), ("rectangle", -1, 2.5), ("cube", -0.5, 3.5)]
+    content = stacks_json([("cube", 0, 0.5)], half)
+    file.write_text(json.dumps(content))
+    assert cli("check", file, "--out", out, "--physics.cell_size", size).code == 1
+    found = read_stacks(out)
+    assert found.cell_size == size  # what was typed is what the file says
+    file.write_text(json.dumps({**content, "cell_size_m": size}))
+    assert cli("check", file, "--out", again).code == 1 and again.read_bytes() == out.read_bytes()
+    file.write_text(json.dumps(content))
+    cli("check", file, "--out", again)
+    for entry, other in zip(found.entries, read_stacks(again).entries, strict=True):
+        assert entry.verdict and other.verdict
+        assert entry.verdict.stable == other.verdict.stable and (entry.verdict.drop == other.verdict.drop).all()
