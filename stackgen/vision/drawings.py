@@ -39,7 +39,7 @@ class Drawn:
         scale: Pixels of `ink` for one of the picture as it was read.
         place: (left, top) of `ink` in the picture as it was read [pixel].
         notes: What is doubtful, a sentence each.
-        even: Whether neighbouring pixels are equal nearly everywhere, as in no photo.
+        like_paper: Whether it is lighter than the background, and has the grain of a photo.
     """
 
     ink: Mask
@@ -47,20 +47,22 @@ class Drawn:
     scale: float
     place: tuple[int, int]
     notes: tuple[str, ...]
-    even: bool
+    like_paper: bool
 
     def drawn_on(self, figure: Mask) -> bool:
         """Tell whether what was found (H, W) is itself drawn on, as a sheet of paper is."""
         import cv2
 
         level = (255 * (1 - self.darkness)).astype(np.uint8)
+        if not self.like_paper:
+            return False
         inner = cv2.erode(figure.astype(np.uint8), np.ones((25, 25), np.uint8)) > 0
         if np.count_nonzero(inner) < 0.1 * inner.size:
             return False
         lighter = cv2.morphologyEx(level, cv2.MORPH_OPEN, np.ones((21, 21), np.uint8))
         strokes = inner & (level.astype(np.int16) - lighter > 0.35 * float(self.darkness[inner].max()) * 255)
         share = np.count_nonzero(strokes) / np.count_nonzero(inner)
-        return bool(0.002 < share < 0.3) and not self.even
+        return bool(0.002 < share < 0.3)
 
 
 def find_drawn(image: Image8) -> Drawn:
@@ -87,7 +89,9 @@ def find_drawn(image: Image8) -> Drawn:
             f"the structure in it is only {columns / scale * image.factor:.0f} x {rows / scale * image.factor:.0f}"
             f" pixels; at least {SMALLEST} are needed, draw or scan it larger"
         )
-    return Drawn(ink, (difference / 255).astype(np.float32), scale, place, notes, is_flat(image))
+    tone = _resized(levels.mean(axis=2), scale)
+    like_paper = not is_flat(image) and float(np.median(tone[ink])) > float(np.median(tone[~ink]))
+    return Drawn(ink, (difference / 255).astype(np.float32), scale, place, notes, like_paper)
 
 
 def _levels(image: Image8) -> tuple[Levels, tuple[int, int]]:
@@ -289,8 +293,21 @@ def as_it_is(image: Image8, grid: Grid) -> Mask | None:
 
 
 def is_drawing(image: Image8) -> bool:
-    """Tell a drawing from a photo without a sheet in it: its ground is of one colour, or it has two tones only."""
-    return min(image.colours.shape[:2]) < 64 or image.alpha is not None or is_even(image) or is_two_tone(image)
+    """Tell a drawing from a photo without a sheet in it.
+
+    Its ground is of one colour, or it has two tones only. What a camera saw has grain: on white it is the photo of
+    paper, whatever lies in its corners.
+    """
+    if min(image.colours.shape[:2]) < 64 or image.alpha is not None or is_two_tone(image):
+        return True
+    return is_even(image) and (is_flat(image) or not _is_on_white(image))
+
+
+def _is_on_white(image: Image8) -> bool:
+    """Tell whether most of the picture's edge is light and colourless."""
+    edges = (image.colours[0], image.colours[-1], image.colours[:, 0], image.colours[:, -1])
+    tone = np.median(np.concatenate(edges), axis=0)
+    return bool(tone.min() > 140 and np.ptp(tone) < 40)
 
 
 def is_flat(image: Image8) -> bool:

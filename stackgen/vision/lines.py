@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.vision.masks import bounding_box
+from stackgen.vision.masks import bounding_box, components
 from stackgen.world import Mask
 
 Floats = NDArray[np.float64]
@@ -19,6 +19,9 @@ LONG = 0.55
 
 FEWEST = 4
 """Paper is ruled when it has at least so many of such lines in one direction."""
+
+FAINTEST = 0.15
+"""The darkest place of a drawing is at least so dark."""
 
 SLOPE = 6.0
 """Lines of paper are level or upright to within this [deg]."""
@@ -44,7 +47,19 @@ def without_rules(ink: Mask, darkness: NDArray[np.float32]) -> tuple[Mask, bool]
             ruled = True
             cleaned = _erased(np.ascontiguousarray(turned), np.ascontiguousarray(depth), lines)
             cleaned = cleaned.T if upright else cleaned
-    return np.ascontiguousarray(cleaned), ruled
+    cleaned = np.ascontiguousarray(cleaned)
+    return (strong(cleaned, darkness) if ruled else cleaned), ruled
+
+
+def strong(ink: Mask, darkness: NDArray[np.float32]) -> Mask:
+    """Keep the parts of the ink that are as dark somewhere as a third of the darkest: the rest is dirt and texture."""
+    if not ink.any():
+        return ink
+    dark = float(np.quantile(darkness[ink], 0.97))
+    labels, areas = components(ink)
+    darkest = np.bincount(labels[darkness > max(FAINTEST, 0.35 * dark)], minlength=len(areas))
+    kept = (darkest > 0) & (areas > 12)
+    return np.asarray(kept[labels])
 
 
 def _rules(ink: Mask, fewest: int) -> list[tuple[float, float]]:

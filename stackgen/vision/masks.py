@@ -41,6 +41,12 @@ def without_specks(mask: Mask, share: float) -> Mask:
     return np.asarray((areas >= max(share * areas.max(), 1))[labels])
 
 
+def touches_edge(mask: Mask, reach: int) -> bool:
+    """Tell whether more than a speck of a mask (H, W) lies within `reach` pixels of its edge."""
+    ends = (mask[:reach], mask[-reach:], mask[:, :reach].T, mask[:, -reach:].T)
+    return any(int(np.count_nonzero(end.any(axis=0))) > 3 for end in ends)
+
+
 def largest(mask: Mask, gap: int) -> Mask:
     """Keep the largest part of a mask; what is at most `gap` pixels apart is one part.
 

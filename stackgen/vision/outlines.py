@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.vision.lines import without_ground
-from stackgen.vision.masks import bounding_box, components, largest, opened
+from stackgen.vision.masks import bounding_box, components, largest, opened, touches_edge
 from stackgen.world import Mask
 
 Ints = NDArray[np.int64]
@@ -333,10 +333,12 @@ def choose(ink: Mask, which: int | None = None, spread: bool = False) -> Filled:
     Raises:
         StackgenError: If there are several drawings and none is asked for, fewer than asked for, or an outline is open.
     """
-    found = [(_one(group)) for group in _groups(ink)]
+    groups = _groups(ink)
+    found = [_one(group) for group in groups]
     drawings = [part for part in found if isinstance(part, Filled)]
-    if not drawings:
-        raise next(part for part in found if isinstance(part, StackgenError))
+    refused = {_extent(group): part for group, part in zip(groups, found, strict=True) if not isinstance(part, Filled)}
+    if refused and (not drawings or max(refused) > max(_extent(part.mask) for part in drawings)):
+        raise refused[max(refused)]
     if not spread:
         drawings = [replace(part, mask=_main_part(part.mask)) for part in drawings]
     most = max(np.count_nonzero(part.mask) for part in drawings)
@@ -348,6 +350,8 @@ def choose(ink: Mask, which: int | None = None, spread: bool = False) -> Filled:
         return rivals[which - 1]
     main = max(drawings, key=lambda part: np.count_nonzero(part.mask))
     rivals = [part for part in rivals if part is main or not _is_round(part.mask)]
+    if not spread:  # what runs off the photo is the table
+        rivals = [part for part in rivals if part is main or not touches_edge(part.mask, len(ink) // 60)]
     beside = [part for part in drawings if part is not main and spread and _is_level(part.mask, main.mask)]
     rivals = [part for part in rivals if not any(part is other for other in beside)]
     if len(rivals) > 1:

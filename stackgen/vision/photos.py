@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.vision.images import Picture
-from stackgen.vision.lines import without_rules
+from stackgen.vision.lines import strong, without_rules
 from stackgen.vision.masks import components
 from stackgen.vision.sheets import Sheet, least_channel, straightened
 from stackgen.world import Mask
@@ -32,6 +32,8 @@ FAINTEST = 0.1
 
 BESIDE = 0.045
 """Strokes are narrower than this, by the sheet's longer edge."""
+
+_DARKER_THAN_SHADOW = 0.33  # share of the light of the paper
 
 _MARGIN = 0.012  # strip along the sheet's edge in which its own edge may show, by its longer edge
 
@@ -72,7 +74,7 @@ def read_page(photo: Picture, sheet: Sheet | None) -> Page:
     if sheet is not None:
         _clear_edge(ink)
     ink, ruled = without_rules(ink, darkness)
-    ink = _strong(ink, darkness)
+    ink = strong(ink, darkness)
     if np.count_nonzero(ink) < 2e-4 * ink.size:
         raise StackgenError("nothing is drawn on the sheet; draw a structure with a dark pen, filled or in outline")
     notes = ("The lines of the paper were removed.",) if ruled else ()
@@ -111,7 +113,8 @@ def _solids(paper: NDArray[np.uint8]) -> tuple[Mask, NDArray[np.float32]]:
         at_edge = np.bincount(np.concatenate([end.ravel() for end in ends]), minlength=len(areas))
         for number in np.flatnonzero((areas > 0.002 * flat.size) & (areas < 0.7 * flat.size)):
             part = labels == number
-            if at_edge[number] <= 0.1 * np.sqrt(areas[number]) and not found[part].all():
+            inside = at_edge[number] <= 0.1 * np.sqrt(areas[number]) or share < _DARKER_THAN_SHADOW
+            if inside and not found[part].all():
                 border = part & (cv2.erode(part.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
                 if step[border].mean() > 0.85:
                     found |= part
@@ -125,14 +128,3 @@ def _clear_edge(ink: Mask) -> None:
     margin = max(2, round(_MARGIN * max(ink.shape)))
     ink[:margin] = ink[-margin:] = False
     ink[:, :margin] = ink[:, -margin:] = False
-
-
-def _strong(ink: Mask, darkness: NDArray[np.float32]) -> Mask:
-    """Keep the parts of the ink that are as dark somewhere as a third of the darkest: the rest is dirt and texture."""
-    if not ink.any():
-        return ink
-    dark = float(np.quantile(darkness[ink], 0.97))
-    labels, areas = components(ink)
-    darkest = np.bincount(labels[darkness > max(1.5 * FAINTEST, 0.35 * dark)], minlength=len(areas))
-    kept = (darkest > 0) & (areas > 12)
-    return np.asarray(kept[labels])

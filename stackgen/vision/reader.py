@@ -21,7 +21,7 @@ from stackgen.vision import depth, drawings, images
 from stackgen.vision.depth import DepthFrame
 from stackgen.vision.images import Image8, Picture
 from stackgen.vision.lines import without_rules
-from stackgen.vision.masks import bounding_box, filling, place
+from stackgen.vision.masks import bounding_box, filling, place, touches_edge
 from stackgen.vision.outlines import Filled, choose
 from stackgen.vision.photos import WORK_SIZE, read_page
 from stackgen.vision.sheets import Sheet, find_sheet, straight_up
@@ -193,7 +193,7 @@ def _of_drawing(image: Image8, grid: Grid, which: int | None, insisted: bool) ->
     drawn = drawings.find_drawn(image)
     ink, _ = without_rules(drawn.ink, drawn.darkness)
     found = choose(ink, which, spread=True)
-    if not insisted and drawn.drawn_on(found.mask):
+    if not insisted and not found.stroke and drawn.drawn_on(found.mask):
         raise StackgenError(_UNCLEAR)
     sure = found.sureness * (0.8 if drawn.notes else 1.0)
     to_picture = np.array([[1 / drawn.scale, 0, drawn.place[0]], [0, 1 / drawn.scale, drawn.place[1]], [0, 0, 1]])
@@ -213,9 +213,11 @@ def _of_photo(image: Image8, sheet: Sheet | None, which: int | None) -> Reading:
         raise StackgenError(_UNCLEAR)
     if _runs_off(found):
         raise StackgenError("the drawing runs off the sheet; leave some blank paper around it")
-    notes = (
-        page.notes if sheet is not None else (*page.notes, "No sheet's edges are seen, so proportions are uncertain.")
-    )
+    notes = page.notes
+    if sheet is None:
+        notes = (*notes, "No sheet's edges are seen, so proportions are uncertain.")
+    elif sheet.slanted:
+        notes = (*notes, "The sheet is seen at a slant, so proportions are uncertain.")
     sure = found.sureness * (0.8 if sheet is None else sheet.sureness) * min(1.0, 0.5 + page.contrast)
     overlay = _outlined(image.colours, found.mask, np.asarray(np.linalg.inv(page.turn)))
     upright = found.mask if sheet is not None else straight_up(found.mask)
@@ -252,14 +254,7 @@ def _hull(mask: Mask) -> NDArray[np.int32]:
 
 def _runs_off(found: Filled) -> bool:
     """Tell whether a drawing reaches the edge of what is seen of the sheet."""
-    mask, reach = found.mask, max(2, round(0.015 * WORK_SIZE))
-    ends = (
-        mask[:reach].any(axis=0),
-        mask[-reach:].any(axis=0),
-        mask[:, :reach].any(axis=1),
-        mask[:, -reach:].any(axis=1),
-    )
-    return any(np.count_nonzero(end) > 3 for end in ends)
+    return touches_edge(found.mask, max(2, round(0.015 * WORK_SIZE)))
 
 
 def _figure(mask: Mask) -> Mask:

@@ -30,6 +30,8 @@ FOCALS = (0.6, 1.6)
 SHEETS = (0.707, 0.773)
 """Proportions of sheets of A4 and of Letter."""
 
+_BETWEEN = 0.755  # nearer to Letter, as most sheets are of A4
+
 LEAST_SHEET = 0.12
 """A sheet is at least this share of the photo."""
 
@@ -51,6 +53,12 @@ class Sheet:
     corners: Floats
     sureness: float
 
+    @property
+    def slanted(self) -> bool:
+        """Whether it is seen at such a slant that its proportions are hard to tell."""
+        lengths = np.linalg.norm(self.corners - np.roll(self.corners, -1, axis=0), axis=1)
+        return bool(min(lengths[i] / lengths[i - 2] for i in range(4)) < 0.7)
+
 
 def find_sheet(photo: Picture) -> Sheet | None:
     """Find the sheet of paper in a photo (h, w, 3); None where no sides of one are seen."""
@@ -58,20 +66,20 @@ def find_sheet(photo: Picture) -> Sheet | None:
     small = np.asarray(cv2.resize(photo, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
     small = np.asarray(cv2.medianBlur(small, 5), np.uint8)
     light, tint = least_channel(small).astype(np.float32), _tint(small)
-    best: tuple[float, Floats] | None = None
+    best: tuple[float, Floats, float] | None = None
     for region in _regions(small):
         corners = _quadrangle(region)
         if corners is None or _is_frame(corners, region.shape):
             continue
-        sureness = _support(light, tint, corners)
+        sureness, seen = _support(light, tint, corners)
         shape = np.array(small.shape[1::-1])
         area = cv2.contourArea(np.clip(corners, 0, shape).astype(np.float32)) / shape.prod()
-        score = sureness * min(1.0, area / 0.25) ** 0.25
+        score = sureness * min(1.0, area / 0.25) ** 0.25 * 0.9 ** (4 - seen)
         if sureness >= SUPPORT and (best is None or score > best[0] + 1e-3):
-            best = score, corners
+            best = score, corners, sureness
     if best is None:
         return None
-    return Sheet(_refined(photo, best[1] / factor, reach=3 / factor), min(1.0, best[0]))
+    return Sheet(_refined(photo, best[1] / factor, reach=3 / factor), best[2])
 
 
 def _refined(photo: Picture, corners: Floats, reach: float) -> Floats:
@@ -222,8 +230,8 @@ def _crossing(one: Floats, two: Floats) -> Floats:
     return np.asarray(p + ((r - p)[0] * b[1] - (r - p)[1] * b[0]) / across * a)
 
 
-def _support(light: NDArray[np.float32], tint: NDArray[np.float32], corners: Floats) -> float:
-    """Return the share of a quadrangle's sides that step down in light or colour, that of the least side."""
+def _support(light: NDArray[np.float32], tint: NDArray[np.float32], corners: Floats) -> tuple[float, int]:
+    """Return the share of a quadrangle's sides that step down, that of the least side, and how many sides are seen."""
     height, width = light.shape
     middle = corners.mean(axis=0)
     least, seen = 1.0, 0
@@ -241,7 +249,7 @@ def _support(light: NDArray[np.float32], tint: NDArray[np.float32], corners: Flo
         duller = tint[v, u] - tint[y, x]
         least = min(least, float(((darker < 0.88) | (duller < -18)).mean()))
         seen += 1
-    return least if seen >= 2 else 0.0
+    return (least if seen >= 2 else 0.0), seen
 
 
 def _clockwise(corners: Floats) -> Floats:
@@ -255,7 +263,7 @@ def _clockwise(corners: Floats) -> Floats:
 def _usual(ratio: float) -> float:
     """Return the proportions of the sheets that people have where they are near: those of A4 and of Letter."""
     short = min(ratio, 1 / ratio)
-    near = min(SHEETS, key=lambda usual: abs(usual - short))
+    near = SHEETS[0] if short < _BETWEEN else SHEETS[1]
     if abs(near - short) > 0.1 * near:
         return ratio
     return near if ratio < 1 else 1 / near
