@@ -18,9 +18,18 @@ class Terminated(KeyboardInterrupt):
     """The system asked this process to end (SIGTERM); whatever answers Ctrl-C answers it, too."""
 
 
+def printable(text: object) -> str:
+    """Write text so that it stays in its line and moves no cursor: what is not printable is shown as its escape.
+
+    >>> printable("a house\\n\\x1b[2J")
+    'a house\\\\n\\\\x1b[2J'
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "backslashreplace").decode() for c in str(text))
+
+
 def warn(line: str) -> None:
     """One line on stderr, each time; Python's own form of a warning has two, and shows the same one once."""
-    warnings.warn_explicit(line, UserWarning, "stackgen", 0)
+    warnings.warn_explicit(printable(line), UserWarning, "stackgen", 0)
 
 
 def require(module: str, extra: str) -> ModuleType:

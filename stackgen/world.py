@@ -271,6 +271,9 @@ PAPER_CATALOGUE = Catalogue(
 """The four shapes of the paper: the long rectangle has three cells, the triangle one, apex up."""
 
 
+_MOST = {"width": 1000, "height": 1000, "image_size": 4096, "pixels_per_cell": 4096}
+_MOST_BLOCKS = 1000
+
 ROOM = 0.2
 """Least space beside and above a full grid in its pictures [cell]: blocks are displaced, and settle."""
 
@@ -308,6 +311,8 @@ class Grid:
             if not 0 < value < np.inf or (whole and value != round(value)):
                 kind = "a whole number of at least 1" if whole else "positive and finite"
                 raise StackgenError(f"grid: {name} must be {kind}, got {value}")
+            if value > _MOST[name]:
+                raise StackgenError(f"grid: {name} must be at most {_MOST[name]}, got {value}")
         if not 0 <= self.ground_margin < self.image_size:
             raise StackgenError(f"grid: ground_margin must lie in 0..image_size, got {self.ground_margin}")
 
@@ -371,8 +376,10 @@ class World:
     max_blocks: int
 
     def __post_init__(self) -> None:
-        if self.max_blocks != int(self.max_blocks) or self.max_blocks < 1:
-            raise StackgenError(f"world: max_blocks must be a whole number of at least 1, got {self.max_blocks}")
+        if self.max_blocks != int(self.max_blocks) or not 1 <= self.max_blocks <= _MOST_BLOCKS:
+            raise StackgenError(
+                f"world: max_blocks must be a whole number from 1 to {_MOST_BLOCKS}, got {self.max_blocks}"
+            )
 
     def to_json(self) -> dict[str, Any]:
         """Plain form, as manifests and cards carry it beside their other facts."""
@@ -391,7 +398,7 @@ class World:
         try:
             grid, max_blocks = Grid(**facts["grid"]), int(facts["max_blocks"])
             return World(Catalogue.from_json(facts["catalogue"]), grid, max_blocks)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise StackgenError(f"a world is a catalogue, a grid and max_blocks: {error!r}") from error
 
 

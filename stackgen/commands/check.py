@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from rich.markup import escape
 from rich.table import Table
 
 from stackgen.api import check
@@ -80,7 +81,7 @@ def _explained(entries: Sequence[StackEntry], physics: Physics) -> tuple[tuple[S
             STANDS if found.stable else FALLS,
             f"{math.degrees(found.margin):.1f}°",
             "" if found.push is None else f"{found.push:.0%}",
-            "; ".join(f"block {i} ({entry.stack.names[i]}): {why}" for i, why in reasons.items()),
+            escape("; ".join(f"block {i} ({entry.stack.names[i]}): {why}" for i, why in reasons.items())),
         )
     return tuple(explained), table
 

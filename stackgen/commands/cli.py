@@ -18,7 +18,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, TextIO
 
-from stackgen.errors import Terminated
+from stackgen.errors import Terminated, printable
 
 BAD_INPUT, BUG, INTERRUPTED, UNREAD, TERMINATED = 2, 70, 130, 141, 143
 
@@ -164,6 +164,8 @@ def explain(error: BaseException) -> str | None:
         return f"{error.strerror or text}: {error.filename}" if error.filename else text
     if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("stackgen"):
         return f"the package {error.name!r} is missing here: pip install {error.name}"
+    if isinstance(error, MemoryError) or "allocate memory" in text:
+        return f"there is not enough memory: {text}" if text else "there is not enough memory"
     # By name: the command line does not import the packages that define them.
     if kinds & {"StackgenError", "ArgumentError", "MisconfigurationException"}:
         return text
@@ -234,7 +236,7 @@ def _complain(verb: str, message: str, code: int) -> int:
     """Say what is wrong in one line; what is written to a terminal cannot move its cursor."""
     line = f"stackgen{' ' if verb else ''}{verb}: {message.removeprefix(f'{verb}: ')}"
     with contextlib.suppress(OSError):
-        print("".join(c if c.isprintable() else ascii(c)[1:-1] for c in line), file=sys.stderr)
+        print(printable(line), file=sys.stderr)
     with contextlib.suppress(OSError):
         sys.stdout.flush()
         return code

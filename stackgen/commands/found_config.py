@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from stackgen.data.sources import is_remote
-from stackgen.errors import StackgenError
-from stackgen.io.text import printable
+from stackgen.errors import StackgenError, printable
 
 _OURS = ("baselines", "models", "training")
 _KNOWN = (

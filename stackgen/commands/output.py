@@ -70,9 +70,9 @@ def tell(*shown: Any, style: str | None = None, **facts: Any) -> None:
         known.update(facts)
     if _form.get() != "text" or not shown:
         return
-    from rich.console import Console
+    from stackgen.io.terminal import Screen
 
-    console = Console(width=None if sys.stdout.isatty() else _WIDE)
+    console = Screen(width=None if sys.stdout.isatty() else _WIDE)
     for item in shown:
         line = isinstance(item, str)
         console.print(item, style=style, markup=not line, highlight=False, soft_wrap=line)

@@ -56,8 +56,22 @@ def _read_files_as(mode: Mode) -> Mode:
         from jsonargparse._optionals import get_omegaconf_loader
 
         loader = get_omegaconf_loader(mode)
-    set_loader(mode, loader, (yaml.YAMLError, ValueError, RecursionError))
+    set_loader(mode, _of_finite_size(loader), (yaml.YAMLError, ValueError, RecursionError))
     return mode
+
+
+def _of_finite_size(loader: Callable[[str], Any]) -> Callable[[str], Any]:
+    """Refuse text whose aliases stand for more than anybody would write, before another reader writes them out."""
+
+    def load(text: str) -> Any:
+        if "&" in text:
+            try:
+                parse_yaml(text, "it")
+            except StackgenError as error:
+                raise ValueError(str(error)) from error
+        return loader(text)
+
+    return load
 
 
 @cache

@@ -6,11 +6,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol
 
-from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from stackgen.commands.output import is_quiet
+from stackgen.io.terminal import Screen
 
 
 class Advance(Protocol):
@@ -45,7 +45,7 @@ def progress_bar(what: str, total: int | None = None) -> Iterator[tuple[Advance,
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-    screen = Console(stderr=True)
+    screen = Screen(stderr=True)
     with Progress(*columns, console=screen, disable=not screen.is_terminal or is_quiet()) as progress:
         task = progress.add_task(what, total=total)
 

@@ -9,14 +9,14 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.progress import Progress
 
 from stackgen.api import Model
 from stackgen.commands.verdict_table import verdict_table
-from stackgen.errors import StackgenError
+from stackgen.errors import StackgenError, printable
 from stackgen.io.files import require_folder, staged
 from stackgen.io.stacks_file import StacksFile, write_stacks
+from stackgen.io.terminal import Screen
 from stackgen.names import CheckerName
 from stackgen.sampling.verified import Budget
 from stackgen.stack import format_block_list
@@ -48,7 +48,7 @@ def answer_all(images: Sequence[Path], folders: Sequence[Path], out: Path, draw:
     results: list[StacksFile] = []
     sheets: list[Picture] = []
     refused: list[StackgenError] = []
-    screen = Console(stderr=True)
+    screen = Screen(stderr=True)
     with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
         task = progress.add_task("", total=len(images))
         try:
@@ -72,22 +72,23 @@ def answer_all(images: Sequence[Path], folders: Sequence[Path], out: Path, draw:
         save_image(out / "overview.png", overview(sheets))
     code = report(results, out, verified)
     for reason in refused:
-        print(f"stackgen: error: {reason}", file=sys.stderr)
+        print(f"stackgen: error: {printable(reason)}", file=sys.stderr)
     return 2 if refused else code
 
 
 def report(results: Sequence[StacksFile], out: Path, verified: bool) -> int:
     """Print what became of the images; the exit code is 1 if a stack falls that was said to be verified."""
-    console = Console()
+    console = Screen()
     console.print(verdict_table("image", [(result.silhouette or "", result.entries) for result in results], most=1))
     falls = False
     for result in results if verified else ():
-        console.print(f"{result.silhouette}: {result.comment}", highlight=False)
+        console.print(f"{result.silhouette}: {result.comment}", highlight=False, markup=False)
         for number, entry in enumerate(result.entries, 1):
             if entry.verdict is None or not entry.verdict.stable:
                 falls = True
                 why = entry.comment or "the simulator does not agree that it stands"
-                console.print(f"[red]{result.silhouette}: stack {number} falls: {why}[/]", highlight=False)
+                line = f"{result.silhouette}: stack {number} falls: {why}"
+                console.print(line, highlight=False, markup=False, style="red")
     for result in results if verified else ():
         most = max((entry.front_iou or 0.0 for entry in result.entries), default=0.0)
         if most < POOR:
@@ -95,9 +96,10 @@ def report(results: Sequence[StacksFile], out: Path, verified: bool) -> int:
                 f"{result.silhouette}: the best fit is {most:.2f}; more cells (--cells), other blocks"
                 " in the inventory, or leaving --blocks out could help",
                 highlight=False,
+                markup=False,
                 soft_wrap=True,
             )
-    console.print(f"wrote {out}", highlight=False)
+    console.print(f"wrote {out}", highlight=False, markup=False)
     return int(falls)
 
 

@@ -15,7 +15,9 @@ from stackgen.data.arrays import FIELDS, StackArrays
 from stackgen.data.manifest import SPLITS, Manifest
 from stackgen.data.sources import read_bytes
 from stackgen.errors import StackgenError
+from stackgen.io.arrays import read_npz
 from stackgen.io.files import write_atomically
+from stackgen.io.text import parse_json
 
 
 def save_npz(path: str | Path, splits: Mapping[Any, StackArrays], manifest: Manifest) -> None:
@@ -55,9 +57,9 @@ def load_npz(path: str) -> tuple[dict[str, StackArrays], Manifest]:
         StackgenError: If the file is missing, broken, or not a compact dataset.
     """
     try:
-        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as file:
-            fields = {name: file[name] for name in FIELDS}
-            split, plain = file["split"], json.loads(str(file["manifest"]))
+        file = read_npz(read_bytes(path))
+        fields = {name: file[name] for name in FIELDS}
+        split, plain = file["split"], parse_json(str(file["manifest"]), path)
     except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise StackgenError(f"{path} is not a compact stackgen dataset: {reason}") from error

@@ -20,6 +20,8 @@ from stackgen.data.arrays import PADDING, StackArrays
 from stackgen.data.compact import write_npz
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
+from stackgen.io.arrays import read_npz
+from stackgen.io.files import read_bytes
 from stackgen.protocols import StabilityChecker, StackSampler
 
 _SCENES_AT_ONCE = 128
@@ -66,12 +68,12 @@ class Preferences:
             StackgenError: If the file is missing, broken, or not such a file.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
-                shapes, silhouettes, template = (file[name] for name in ("shapes", "silhouettes", "template"))
-                number = int(file["num_shapes"])
-                better, worse = (
-                    StackArrays(shapes, file[name], silhouettes, template, number) for name in ("better", "worse")
-                )
+            file = read_npz(read_bytes(path))
+            shapes, silhouettes, template = (file[name] for name in ("shapes", "silhouettes", "template"))
+            number = int(file["num_shapes"])
+            better, worse = (
+                StackArrays(shapes, file[name], silhouettes, template, number) for name in ("better", "worse")
+            )
         except FileNotFoundError as error:
             raise StackgenError(f"no preferences at {path}: make them with `stackgen prefer`") from error
         except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:

@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 
 from stackgen.data.manifest import ShardEntry, shard_entry
 from stackgen.errors import StackgenError
-from stackgen.io.files import write_atomically
+from stackgen.io.arrays import read_npy
+from stackgen.io.files import read_bytes, write_atomically
 from stackgen.stack import Stack
 from stackgen.world import Catalogue, Mask
 
@@ -66,9 +67,7 @@ def decode(members: Mapping[str, Any]) -> Sample:
         ValueError: If a member is not what the format says.
     """
     key = str(members["__key__"])
-    shapes, poses, packed = (
-        np.load(io.BytesIO(members[f"{name}.npy"]), allow_pickle=False) for name in ("shapes", "poses", "silhouette")
-    )
+    shapes, poses, packed = (read_npy(members[f"{name}.npy"]) for name in ("shapes", "poses", "silhouette"))
     meta, picture = json.loads(members["meta.json"]), np.unpackbits(packed, axis=1).astype(bool)
     if shapes.dtype != np.uint8 or shapes.ndim != 1 or poses.dtype != np.float32 or poses.shape != (len(shapes), 6):
         raise ValueError(f"sample {key}: shapes {shapes.shape} do not fit poses {poses.shape}")
@@ -99,6 +98,8 @@ def write_shard(path: Path, samples: Iterable[Sample]) -> ShardEntry:
 def is_whole(path: Path, sha256: str) -> bool:
     """Tell whether a shard is there and has the checksum that the manifest names; samples are not decoded."""
     try:
+        if not path.is_file():  # a pipe would be waited for
+            return False
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest() == sha256
     except FileNotFoundError:
@@ -116,7 +117,7 @@ def read_shard(path: str | Path, sha256: str | None = None) -> Iterator[Sample]:
         StackgenError: If the file is missing, truncated or not a shard, or has another checksum.
     """
     try:
-        content = Path(path).read_bytes()
+        content = read_bytes(path)
         if compressed := compression_of(content):
             raise ValueError(f"it is compressed with {compressed}, and a shard is a plain tar")
         if sha256 is not None and hashlib.sha256(content).hexdigest() != sha256:

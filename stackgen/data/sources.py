@@ -19,6 +19,7 @@ from pathlib import Path
 from stackgen.data.manifest import ShardEntry
 from stackgen.data.shards import compression_of
 from stackgen.errors import StackgenError
+from stackgen.io.files import read_bytes as read_file
 
 PIPE = "pipe:"
 FILE_NAME = "{file}"
@@ -75,7 +76,7 @@ def read_bytes(path: str) -> bytes:
     try:
         if path.startswith(PIPE):
             return _output(path)
-        return _fetch(path) if is_remote(path) else Path(path).read_bytes()
+        return _fetch(path) if is_remote(path) else read_file(path)
     except FileNotFoundError as error:
         raise StackgenError(f"there is no file {path}") from error
     except StackgenError:

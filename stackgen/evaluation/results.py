@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +19,7 @@ from stackgen.errors import StackgenError
 from stackgen.evaluation.intervals import Estimate, clustered_ratio
 from stackgen.evaluation.metrics import METRICS, SampleScore, SceneScore
 from stackgen.io.files import write_atomically, write_json
+from stackgen.io.text import read_json
 from stackgen.stack import Stack
 from stackgen.world import VIEWS, Catalogue
 
@@ -173,7 +173,7 @@ def read_evaluation(path: Path) -> tuple[Evaluation, Question]:
         StackgenError: If the file is missing, damaged or something else.
     """
     try:
-        data = json.loads(path.read_text())
+        data = read_json(path)
         if data["format"] == _BEFORE:
             raise StackgenError(f"{path} was written by an older version, and is not read")
         if data["format"] != FORMAT:

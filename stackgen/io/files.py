@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import json
 import os
 import re
 import secrets
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -120,6 +122,26 @@ def staged(folder: Path, replaces: str) -> Iterator[Path]:
         shutil.rmtree(stage, ignore_errors=True)
         if new and not any(folder.iterdir()):
             folder.rmdir()
+
+
+_OWN_PIPES = ("/dev/fd/", "/dev/stdin", "/proc/self/fd/")
+"""Where a shell puts what a command is given by `<(...)`."""
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Read a whole file; what is no file, such as a pipe that nobody writes to, is not waited for.
+
+    Raises:
+        OSError: If it cannot be read.
+    """
+    number = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if not stat.S_ISREG(os.fstat(number).st_mode) and not str(path).startswith(_OWN_PIPES):
+        os.close(number)
+        kind = errno.EISDIR if Path(path).is_dir() else errno.EINVAL
+        raise OSError(kind, os.strerror(kind) if kind == errno.EISDIR else "it is no regular file", str(path))
+    os.set_blocking(number, True)
+    with os.fdopen(number, "rb") as file:
+        return file.read()
 
 
 def require_folder(folder: Path, asked: str) -> None:

@@ -15,7 +15,8 @@ def _validator(schema: Path, part: str) -> Any:
     import jsonschema
 
     content = read_json(schema)
-    return jsonschema.Draft202012Validator({**content, "$ref": f"#/$defs/{part}"} if part else content)
+    meant = {"$defs": content["$defs"], "$ref": f"#/$defs/{part}"} if part else content
+    return jsonschema.Draft202012Validator(meant)
 
 
 def require_valid(data: Any, schema: Path, part: str = "") -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.io.files import write_atomically
+from stackgen.io.files import read_bytes, write_atomically
 from stackgen.io.schemas import require_valid
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
@@ -200,7 +200,7 @@ def schema() -> dict[str, Any]:
 
 def _text(path: Path) -> str:
     try:
-        content = sys.stdin.buffer.read() if path == Path("-") else path.read_bytes()
+        content = sys.stdin.buffer.read() if path == Path("-") else read_bytes(path)
         text = content.decode("utf-8-sig")
     except FileNotFoundError:
         raise StackgenError("no such file") from None

@@ -14,7 +14,8 @@ from typing import Any
 
 import yaml
 
-from stackgen.errors import StackgenError
+from stackgen.errors import StackgenError, printable
+from stackgen.io.files import read_bytes
 
 _MARKS = {codecs.BOM_UTF16_LE: "UTF-16", codecs.BOM_UTF16_BE: "UTF-16"}
 _FLOAT = re.compile(
@@ -30,7 +31,7 @@ def read_text(path: str | Path) -> str:
         StackgenError: If it is missing, no file, or text of another encoding; the line names it.
     """
     try:
-        return decode_text(Path(path).read_bytes(), path)
+        return decode_text(read_bytes(path), path)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise StackgenError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
 
@@ -67,7 +68,9 @@ def parse_yaml(text: str, path: str | Path) -> Any:
         StackgenError: If it is no YAML.
     """
     try:
-        return yaml.load(text, Loader=_Loader)
+        content = yaml.load(text, Loader=_Loader)
+        _require_finite_size(content)
+        return content
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         where = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
@@ -108,15 +111,6 @@ def to_yaml(content: Any) -> str:
     return yaml.dump(content, Dumper=_Dumper, default_flow_style=False, allow_unicode=True, sort_keys=False)
 
 
-def printable(text: object) -> str:
-    """Write text so that it stays in its line and moves no cursor: what is not printable is shown as its escape.
-
-    >>> printable("a house\\n\\x1b[2J")
-    'a house\\\\n\\\\x1b[2J'
-    """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape", "backslashreplace").decode() for c in str(text))
-
-
 def in_markdown(text: object) -> str:
     """Write text so that a reader of Markdown shows it as it is.
 
@@ -132,12 +126,48 @@ def in_a_plot(text: object) -> str:
     return printable(text).replace("$", r"\$")
 
 
+_MOST_VALUES = 200_000
+"""Values that a YAML file stands for, with its aliases written out."""
+
+
+def _require_finite_size(content: Any) -> None:
+    """Refuse aliases that stand for more than anybody would write.
+
+    Raises:
+        yaml.YAMLError: If they do.
+    """
+    sizes: dict[int, float] = {}
+
+    def size(value: Any) -> float:
+        if not isinstance(value, dict | list):
+            return 1
+        if id(value) not in sizes:
+            sizes[id(value)] = float("inf")  # what holds itself has no end
+            inner = [*value.keys(), *value.values()] if isinstance(value, dict) else value
+            sizes[id(value)] = 1 + sum(map(size, inner))
+        return sizes[id(value)]
+
+    if size(content) > _MOST_VALUES:
+        raise yaml.YAMLError(f"its aliases stand for more than {_MOST_VALUES} values")
+
+
 class _Loader(yaml.SafeLoader):
     """YAML 1.1 as PyYAML reads it, with the numbers of YAML 1.2 and without dates."""
+
+    def flatten_mapping(self, node: yaml.MappingNode) -> None:
+        """Merge what `<<` names, as long as it stays a mapping that somebody could have written."""
+        super().flatten_mapping(node)
+        if len(node.value) > _MOST_VALUES // 20:
+            raise yaml.YAMLError("what its `<<` merge is too large")
 
 
 class _Dumper(yaml.SafeDumper):
     """Writes text in quotes if any version of YAML would not read it as text."""
+
+    def represent_text(self, data: str) -> yaml.ScalarNode:
+        """Write text; what is not printable stands in quotes, escaped: YAML takes some of it for the end of a line."""
+        plain = all(c.isprintable() or c == "\n" for c in data)
+        return self.represent_scalar("tag:yaml.org,2002:str", data, style=None if plain else '"')
 
     def ignore_aliases(self, data: Any) -> bool:
         """Write everything out, for people."""
@@ -151,3 +181,4 @@ _Loader.yaml_implicit_resolvers = {
 for _kind in (_Loader, _Dumper):
     # After those that are there: a whole number stays one.
     _kind.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(f"(?:{_FLOAT.pattern})$"), [*"-+.0123456789"])
+_Dumper.add_representer(str, _Dumper.represent_text)

@@ -63,12 +63,12 @@ class TransformerConfig:
 
     def __post_init__(self) -> None:
         for name in ("width", "heads", "feedforward", "patch", "stride"):
-            if getattr(self, name) < 1:
-                raise StackgenError(f"{name} must be at least 1, got {getattr(self, name)}")
+            if not 1 <= getattr(self, name) <= 65_536:
+                raise StackgenError(f"{name} must lie in 1..65536, got {getattr(self, name)}")
         if self.width % 2 or self.width % self.heads:
             raise StackgenError(f"width must be even and a multiple of heads ({self.heads}), got {self.width}")
-        if self.layers < 0 or self.memory_layers < 0 or not 0 <= self.dropout < 1:
-            raise StackgenError("layers and memory_layers must be at least 0, and dropout must lie in [0, 1)")
+        if not 0 <= self.layers <= 1000 or not 0 <= self.memory_layers <= 1000 or not 0 <= self.dropout < 1:
+            raise StackgenError("layers and memory_layers must lie in 0..1000, and dropout in [0, 1)")
 
     @property
     def trims(self) -> bool:

@@ -8,7 +8,6 @@ here unpickles: checkpoints are read with `weights_only=True`.
 from __future__ import annotations
 
 import hashlib
-import json
 import pickle
 import zipfile
 import zlib
@@ -22,7 +21,8 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from stackgen.errors import StackgenError
-from stackgen.io.files import write_atomically, write_json
+from stackgen.io.files import read_bytes, write_atomically, write_json
+from stackgen.io.text import read_json
 from stackgen.world import World
 
 FORMAT = "stackgen.weights/1"
@@ -55,14 +55,16 @@ def read_weights(
     content = _read_bytes(path)
     card_path = path.with_suffix(".json")
     try:
-        card = json.loads(card_path.read_text())
+        if not card_path.exists():
+            raise StackgenError(f"{path} has no card: {card_path.name} must lie beside it")
+        card = read_json(card_path)
         tensors = load(content)
-    except FileNotFoundError as error:
-        raise StackgenError(f"{path} has no card: {card_path.name} must lie beside it") from error
     except (OSError, ValueError, SafetensorError) as error:
         raise StackgenError(f"{path} or its card {card_path.name} is damaged: {error}") from error
     if not isinstance(card, dict) or card.get("format") != FORMAT:
         raise StackgenError(f"{card_path} is not a {FORMAT} card")
+    if not isinstance(card.get("kind"), str) or not isinstance(card.get("config"), dict):
+        raise StackgenError(f"{card_path} is damaged: it does not say the kind of network, or its config")
     if card.get("sha256") != hashlib.sha256(content).hexdigest():
         raise StackgenError(f"{path} is not the file its card {card_path.name} was written for: the checksums differ")
     return tensors, card
@@ -201,7 +203,7 @@ def _read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 def _read_bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bytes(path)
     except OSError as error:
         raise StackgenError(f"{path} cannot be read: {error.strerror}") from error
 

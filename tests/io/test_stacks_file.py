@@ -153,7 +153,7 @@ WRONG: list[tuple[list[Any], Any, str]] = [
     (
         ["stacks", 0, "blocks"],
         plain()["stacks"][0]["blocks"] * 501,
-        r"\$\.stacks\[0\]\.blocks: has 1002 items; at most 1000",
+        r"\$\.stacks\[0\]\.blocks: has 1002 items; at most 200",
     ),
     (
         ["stacks", 0, "blocks", 0, "position"],

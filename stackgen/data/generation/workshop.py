@@ -21,6 +21,7 @@ from stackgen.data.manifest import Manifest, ShardEntry, is_shard_name, read_sha
 from stackgen.data.shards import encode_shard, is_whole, read_shard
 from stackgen.errors import StackgenError
 from stackgen.io.files import is_left_over, write_atomically
+from stackgen.io.text import parse_json, read_text
 
 PROGRESS, PARTS = "progress", "parts"
 """Folders within a dataset that is not complete yet: the record of whole shards, and what is drawn from."""
@@ -111,15 +112,15 @@ def claim(out: Path, plain: dict[str, Any], means_the_same: Callable[[Any], bool
     if not record.exists():
         write_atomically(record, mine.encode())
         return
-    theirs = record.read_text()
+    theirs = read_text(record)
     if theirs != mine and not means_the_same(_json(theirs)):
         raise StackgenError(f"{out} holds a dataset made with other settings; choose another folder or delete it")
 
 
 def _json(text: str) -> Any:
     try:
-        return json.loads(text)
-    except ValueError:
+        return parse_json(text, "generate.json")
+    except StackgenError:
         return None
 
 

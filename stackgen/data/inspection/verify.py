@@ -15,6 +15,7 @@ from stackgen.data.decoding import Decoded, decode_shard
 from stackgen.data.generation.workshop import PARTS, PROGRESS
 from stackgen.data.manifest import Manifest, ShardEntry
 from stackgen.data.shards import compression_of
+from stackgen.io.files import read_bytes
 from stackgen.io.text import read_json
 
 Fault = Literal["missing", "truncated", "altered", "unreadable", "wrong", "foreign"]
@@ -87,7 +88,7 @@ def _of_manifest(folder: Path, manifest: Manifest) -> list[Problem]:
 def _of_shard(folder: Path, manifest: Manifest, entry: ShardEntry, seen: _Seen) -> list[Problem]:
     name = entry["file"]
     try:
-        content = (folder / name).read_bytes()
+        content = read_bytes(folder / name)
     except FileNotFoundError:
         return [Problem(name, "missing", f"{entry['samples']} stacks")]
     except OSError as error:

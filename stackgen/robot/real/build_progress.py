@@ -11,6 +11,7 @@ import numpy as np
 
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_json
+from stackgen.io.text import read_json
 from stackgen.robot.workcell import Workcell
 from stackgen.stack import Stack
 
@@ -63,7 +64,7 @@ class BuildProgress:
         if not path.is_file():
             raise StackgenError(f"--resume: {path} does not exist: there is no build to go on with; leave --resume out")
         try:
-            plain = json.loads(path.read_text())
+            plain = read_json(path)
             if plain.pop("format") != FORMAT:
                 raise ValueError("format")
             found = BuildProgress(**plain)

@@ -8,7 +8,7 @@ is then 0 while the jaws move, 1 or 2 when something stopped them as they opened
 from __future__ import annotations
 
 import contextlib
-import socket
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from stackgen.errors import StackgenError
+from stackgen.robot.real.lines import LineLink
 from stackgen.robot.real.program import check_host
 
 PORT = 63352
@@ -24,7 +25,8 @@ POSITIONS = 255
 ACTIVE, MOVING, STOPPED_OPENING, HOLDS = 3, 0, 1, 2  # of STA the first, of OBJ the others
 
 _LOOK = 0.02  # between looks at jaws that move [s]
-_PATIENCE = 5.0  # with an answer, and with jaws that do not stop [s]
+_PATIENCE = 3.0  # with an answer [s]
+_STOPPING = 5.0  # time that jaws take to stop, at most [s]
 _ACTIVATION = 15.0  # an activation opens and closes them once [s]
 
 
@@ -136,9 +138,8 @@ class RobotiqJaws:
     def __init__(self, gripper: Gripper, host: str, tick: Callable[[], None] = lambda: None) -> None:
         self.gripper, self.tick = gripper, tick
         self.where = f"{gripper.host or host}:{gripper.port}"
-        self._rest = b""
         try:
-            self._socket = socket.create_connection((gripper.host or host, gripper.port), timeout=_PATIENCE)
+            self._link = LineLink(gripper.host or host, gripper.port, _PATIENCE)
         except OSError as error:
             raise StackgenError(
                 f"no Robotiq gripper answers at {self.where} ({error.strerror or error}): is its URCap installed?"
@@ -176,12 +177,12 @@ class RobotiqJaws:
     def disconnect(self) -> None:
         """Close the socket; the gripper keeps its grip."""
         with contextlib.suppress(OSError):
-            self._socket.close()
+            self._link.close()
 
     def get(self, name: str) -> int:
         """Read a variable."""
         answer = self._ask(f"GET {name}").split()
-        if len(answer) != 2 or answer[0] != name or not answer[1].lstrip("-").isdigit():
+        if len(answer) != 2 or answer[0] != name or not re.fullmatch(r"-?[0-9]{1,9}", answer[1]):
             raise StackgenError(f"the gripper at {self.where} answered {' '.join(answer)!r} when asked for {name}")
         return int(answer[1])
 
@@ -195,8 +196,8 @@ class RobotiqJaws:
     def _go(self, position: int, force: float) -> int:
         """Move to a position, wait, and return OBJ."""
         self.set(FOR=self.gripper.force(force), SPE=self.gripper.rate, POS=position, GTO=1)
-        self._wait("take the order", lambda: self.get("PRE") == position, _PATIENCE)
-        self._wait("come to rest", lambda: self.get("OBJ") != MOVING, _PATIENCE)
+        self._wait("take the order", lambda: self.get("PRE") == position, _STOPPING)
+        self._wait("come to rest", lambda: self.get("OBJ") != MOVING, _STOPPING)
         return self.get("OBJ")
 
     def _wait(self, what: str, done: Callable[[], bool], patience: float) -> None:
@@ -213,19 +214,9 @@ class RobotiqJaws:
     def _ask(self, line: str) -> str:
         """Send a line and read the answer; the server ends its values with a newline, its `ack` with nothing."""
         try:
-            self._socket.sendall(line.encode() + b"\n")
-            while not (self._rest.startswith(b"ack") or b"\n" in self._rest):
-                data = self._socket.recv(256)
-                if not data:
-                    raise ConnectionError("it closed the connection")
-                self._rest += data
+            return self._link.ask(line, (b"ack",))
         except OSError as error:
             raise StackgenError(f"lost the gripper at {self.where}: {error.strerror or error}") from error
-        if self._rest.startswith(b"ack"):
-            self._rest = self._rest[3:].lstrip(b"\r\n")
-            return "ack"
-        answer, _, self._rest = self._rest.partition(b"\n")
-        return answer.decode("ascii", "replace").strip()
 
 
 class DigitalJaws:

@@ -7,11 +7,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_atomically
+from stackgen.io.terminal import Screen
 from stackgen.robot.backend import ArmBackend, execute
 from stackgen.robot.planning.arm_model import arm_model
 from stackgen.robot.planning.plan import BlockPlan, BuildPlan
@@ -111,14 +112,14 @@ def show(build: RealBuild) -> None:
     for step in plan.blocks:
         place = ", ".join(f"{1e3 * number:.0f}" for number in step.goal[:3, 3])
         table.add_row(
-            f"{step.block} ({plan.stack.names[step.block]})",
+            escape(f"{step.block} ({plan.stack.names[step.block]})"),
             str(plan.order.index(step.block) + 1),
             f"{place} mm",
             str(len(step.actions)),
             f"{step.duration:.0f} s",
             f"{step.clearance.distance * 1e3:.1f} mm",
         )
-    Console().print(table)
+    Screen().print(table)
 
 
 def confirm(build: RealBuild, host: str, yes: bool) -> None:
@@ -133,7 +134,7 @@ def confirm(build: RealBuild, host: str, yes: bool) -> None:
         return
     if not sys.stdin.isatty():
         raise StackgenError("--execute asks before the arm moves: run it in a terminal, or say --yes")
-    screen = Console(stderr=True)
+    screen = Screen(stderr=True)
     screen.print(
         f"The arm at {host} will move. {build.progress.describe()}. The blocks lie in their slots, nobody is within"
         " reach, and a hand is at the emergency stop?",

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import struct
 import sys
 import time
 from collections.abc import Iterator
@@ -77,7 +78,7 @@ class UrArm:
         self.host, self.workcell, self.controller, self.gripper = host, workcell, controller, gripper
         control, receive = require("rtde_control", "ur"), require("rtde_receive", "ur")
         require_ready(host)
-        _require_port(host, PORT)
+        _require_rtde(host, PORT)
         self._control: Any = None
         self._jaws: RealJaws | None = None
         self._stopped: str | None = None
@@ -363,9 +364,17 @@ def _descriptor(stream: Any) -> int | None:
         return None
 
 
-def _require_port(host: str, port: int) -> None:
-    """See that a port is open: the client itself would wait for minutes."""
+_HELLO, _WELCOME = struct.pack(">HBH", 5, ord("V"), 2), struct.pack(">HBB", 4, ord("V"), 1)
+"""Question for version 2 of RTDE's protocol, and the answer that accepts it."""
+
+
+def _require_rtde(host: str, port: int) -> None:
+    """See that the port answers as RTDE does: the client itself would wait for minutes, or for ever."""
     try:
-        socket.create_connection((host, port), timeout=3.0).close()
+        with socket.create_connection((host, port), timeout=3.0) as link:
+            link.sendall(_HELLO)
+            answer = link.recv(len(_WELCOME), socket.MSG_WAITALL)
     except OSError as error:
         raise StackgenError(f"the controller at {host} does not open port {port}: {error.strerror or error}") from error
+    if answer != _WELCOME:
+        raise StackgenError(f"the controller at {host} does not speak RTDE on port {port}")

@@ -395,3 +395,9 @@ def test_jobs_that_make_ranges_share_a_folder(small: Path, shards: dict[int, Mad
     generate_range(SMALL, out, range(2), Meeting(shards))
     generate(SMALL, out, executor=Stored(shards))
     assert contents(out) == contents(small)
+
+
+def test_a_record_that_is_true_is_believed(small: Path, shards: dict[int, MadeShard], tmp_path: Path) -> None:
+    out = tmp_path / "ranges"
+    generate_range(SMALL, out, range(3), Stored(shards))
+    generate_range(SMALL, out, range(3), Stored({}))

@@ -136,7 +136,7 @@ def test_a_full_disk_is_one_line_and_nothing_is_lost(
     small: Path, shards: dict[int, MadeShard], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "small"
-    left = iter(range(5))
+    left = iter(range(10))  # each file is flushed, and its folder
 
     def full(file: int) -> None:
         if next(left, None) is None:

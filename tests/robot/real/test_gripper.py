@@ -1,5 +1,10 @@
 """The jaws: Robotiq's words over a real socket, and a digital output."""
 
+import socket
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -52,6 +57,33 @@ def test_jaws_that_go_away_are_one_line(tmp_path: Path) -> None:
         jaws = RobotiqJaws(Gripper(), controller.host)
     with pytest.raises(StackgenError, match="lost the gripper at"):
         jaws.open(0.05)
+
+
+def _drips(link: socket.socket) -> None:
+    while True:
+        link.sendall(b"P")
+        time.sleep(0.2)
+
+
+def _floods(link: socket.socket) -> None:
+    while True:
+        link.sendall(b"x" * 65536)
+
+
+@pytest.mark.parametrize("handle", [_drips, _floods, lambda link: link.recv(100) and time.sleep(10)])
+def test_jaws_that_drip_flood_or_say_nothing_are_one_line_soon(handle: Callable[[socket.socket], None]) -> None:
+    def serve() -> None:
+        link, _ = listener.accept()
+        with link, suppress(OSError):
+            handle(link)
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threading.Thread(target=serve, daemon=True).start()
+        jaws, begin = RobotiqJaws(Gripper(port=listener.getsockname()[1]), "127.0.0.1"), time.monotonic()
+        with pytest.raises(StackgenError, match="lost the gripper") as error:
+            jaws.opening()
+        jaws.disconnect()
+    assert str(error.value).isprintable() and time.monotonic() - begin < 4
 
 
 @pytest.mark.parametrize("closed", [True, False])
