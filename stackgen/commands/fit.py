@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import os
 import signal
 import sys
@@ -227,7 +228,9 @@ class StackgenCLI(LightningCLI):
         if self.folder is None or not self.trainer.is_global_zero:
             return
         path = self.folder / "metrics.json"
-        write_json(path, {name: float(value) for name, value in self.trainer.callback_metrics.items()})
+        numbers = {name: float(value) for name, value in self.trainer.callback_metrics.items()}
+        # Of few scenes some metrics do not exist.
+        write_json(path, {name: value if math.isfinite(value) else None for name, value in numbers.items()})
         print(f"wrote {path}")
 
 
