@@ -189,7 +189,7 @@ def _from_image(image: Path, file: Path | None, wanted: Wanted, picture: Picture
         found = stacks_of_picture(
             reading,
             image.name,
-            load(wanted.weights),
+            None if wanted.weights == DEFAULT else load(wanted.weights),
             inventory=wanted.inventory,
             budget=wanted.budget,
             seed=wanted.seed,

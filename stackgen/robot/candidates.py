@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-from stackgen.api import Model
+from stackgen.api import Model, best
 from stackgen.errors import StackgenError
 from stackgen.io.stacks_file import StacksFile
 from stackgen.robot.build import PlannedBuild
 from stackgen.sampling.verified import Budget
+from stackgen.search.solver import SearchSettings
 from stackgen.stack import Stack
 from stackgen.vision.reader import Reading, filling, place
 
@@ -20,36 +21,38 @@ NUMBER = 3
 def stacks_of_picture(
     reading: Reading,
     name: str,
-    model: Model,
+    model: Model | None = None,
     *,
     inventory: str | None = None,
     budget: str | None = None,
     seed: int = 0,
     on_step: Callable[[], None] = lambda: None,
 ) -> StacksFile:
-    """Sample stacks for what is in a picture, and keep those that stand, the best first.
+    """Find stacks for what is in a picture, and keep those that stand, the best first.
 
     Args:
         reading: What was read in the picture.
         name: Name of the picture, for errors and what is written.
-        model: Model that predicts the block list, samples, and checks.
+        model: Model that predicts the block list, samples, and checks; by default search and network look for the best
+            stacks together, at any scale.
         inventory: Blocks that there are, such as `cube=4,rectangle=3`.
-        budget: Time such as `5s`, or number of draws, that finding a stack may cost.
+        budget: Time such as `5s` that finding a stack may cost; for a model also a number of draws.
         seed: Seed of the stacks.
         on_step: Called at most `NUMBER + 1` times, as the work proceeds.
 
     Raises:
         StackgenError: If no stack stands.
     """
-    grid, figure = model.world.grid, reading.figure
-    found = model.sample_verified(
-        place(figure, grid, filling(figure, grid)) if reading.exact is None else reading.exact,
-        NUMBER,
-        seed,
-        inventory=inventory,
-        budget=None if budget is None else Budget.parse(budget),
-        on_step=on_step,
-    )
+    limit = None if budget is None else Budget.parse(budget)
+    if model is None:
+        if limit is not None and limit.seconds is None:
+            raise StackgenError(f"--budget {budget} is a number of draws, which limits a model's samples; give a time")
+        search = SearchSettings(seconds=None if limit is None else limit.seconds)
+        found = best(reading, NUMBER, seed, inventory=inventory, search=search, on_step=on_step)
+    else:
+        grid, figure = model.world.grid, reading.figure
+        target = place(figure, grid, filling(figure, grid)) if reading.exact is None else reading.exact
+        found = model.sample_verified(target, NUMBER, seed, inventory=inventory, budget=limit, on_step=on_step)
     standing = tuple(entry for entry in found.entries if entry.verdict is not None and entry.verdict.stable)
     if not standing:
         raise StackgenError(f"{name}: none of the stacks that were tried stands; try a larger --budget")

@@ -222,7 +222,7 @@ def _without_rim(mask: Mask) -> Mask:
     for turns in range(4):
         side = np.rot90(kept, turns)  # a view: what is removed from it is removed from the mask
         shares = side[: max(2, round(2 * _BORDER * len(side)))].mean(axis=1)
-        if shares[0] > 0.85 and shares[len(shares) // 2 :].max() < 0.5:
+        if shares[0] > 0.85 and np.median(shares[len(shares) // 2 :]) < 0.5:
             side[: int(np.argmax(shares < 0.5)) + 1] = False
     return kept
 

@@ -336,9 +336,9 @@ def choose(ink: Mask, which: int | None = None, spread: bool = False) -> Filled:
     groups = _groups(ink)
     found = [_one(group) for group in groups]
     drawings = [part for part in found if isinstance(part, Filled)]
-    refused = {_extent(group): part for group, part in zip(groups, found, strict=True) if not isinstance(part, Filled)}
-    if refused and (not drawings or max(refused) > max(_extent(part.mask) for part in drawings)):
-        raise refused[max(refused)]
+    refused = {_width(group): part for group, part in zip(groups, found, strict=True) if not isinstance(part, Filled)}
+    if refused and (not drawings or max(refused) > max(_width(part.mask) for part in drawings)):
+        raise refused[max(refused)]  # never a name beside an outline that is open
     if not spread:
         drawings = [replace(part, mask=_main_part(part.mask)) for part in drawings]
     most = max(np.count_nonzero(part.mask) for part in drawings)
@@ -365,6 +365,11 @@ def choose(ink: Mask, which: int | None = None, spread: bool = False) -> Filled:
     for part in beside:
         mask |= part.mask
     return Filled(mask, main.stroke, notes, main.sureness * (0.95 if left_out else 1.0))
+
+
+def _width(mask: Mask) -> int:
+    """Return the lesser edge of a mask's box, which is small for a line [pixel]."""
+    return min(mask[bounding_box(mask)].shape)
 
 
 def _groups(ink: Mask) -> list[Mask]:
