@@ -87,11 +87,12 @@ def compiled(shapes: Sequence[Shape], physics: Physics) -> mujoco.MjModel:
     # Explicit integration breaks down where blocks that lay inside each other are thrown apart, spinning.
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    solref, solimp = (list(map(float, MUJOCO_NUMBERS[name].split())) for name in ("solref", "solimp"))
     surface = {
         "friction": [physics.friction, 0, 0],  # of two surfaces MuJoCo takes the larger coefficient
         "condim": 3,
-        "solref": MUJOCO_NUMBERS["solref"],
-        "solimp": [*MUJOCO_NUMBERS["solimp"], 0.5, 2],
+        "solref": solref,
+        "solimp": [*solimp, 0.5, 2],
     }
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], **surface)
     meshes: dict[Shape, str] = {}

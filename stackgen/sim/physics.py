@@ -23,7 +23,7 @@ from stackgen.world import Shape
 Engine = Literal["bullet", "mujoco"]
 """The engines that simulate."""
 
-MUJOCO_NUMBERS: dict[str, Any] = {"time_step": 0.001, "solref": [0.004, 1.0], "solimp": [0.99, 0.999, 0.0001]}
+MUJOCO_NUMBERS: dict[str, Any] = {"time_step": 0.001, "solref": "0.004 1", "solimp": "0.99 0.999 0.0001"}
 """MuJoCo's step [s]; the time constant [s] and the damping ratio of its contacts; their least and greatest
 impedance, and the depth at which that is reached [m]. They take the place of Bullet's numbers."""
 
@@ -131,7 +131,7 @@ class Physics:
     def settings_of(made: Mapping[str, Any]) -> dict[str, Any]:
         """Return the arguments behind a plain form; without an engine, or with an unknown one, those of Bullet.
 
-        >>> Physics.settings_of({"engine": "mujoco 4.0.0", "friction": 0.3, "time_step": 0.001, "solref": [0.004, 1.0]})
+        >>> Physics.settings_of({"engine": "mujoco 4.0.0", "friction": 0.3, "time_step": 0.001, "solref": "0.004 1"})
         {'engine': 'mujoco', 'friction': 0.3}
         """
         mujoco = str(made.get("engine")).startswith("mujoco")
