@@ -25,7 +25,15 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_only
 
 from stackgen.commands.found_config import described, taken_from
 from stackgen.commands.old_names import renew
-from stackgen.commands.parsing import CONFIG_FLAGS, epilog, option_values, own_sections, parse, parser_options
+from stackgen.commands.parsing import (
+    CONFIG_FLAGS,
+    blaming_values,
+    epilog,
+    option_values,
+    own_sections,
+    parse,
+    parser_options,
+)
 from stackgen.data.datamodule import StackDataModule
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_json
@@ -177,6 +185,11 @@ class StackgenCLI(LightningCLI):
             config.ckpt_path = str(_checkpoint_of(config.ckpt_path))
         if config.ckpt_path is not None:
             _check_checkpoint(Path(config.ckpt_path))
+
+    def instantiate_classes(self) -> None:
+        """Make model, data and trainer; what a constructor cannot do with a value is the configuration's fault."""
+        with blaming_values():
+            super().instantiate_classes()
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """Make the trainer, which knows what process this is, then the run's folder for its logs and checkpoints."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
@@ -24,6 +25,7 @@ from jsonargparse import (
 )
 from jsonargparse.typing import register_type
 
+from stackgen.commands.cli import explain
 from stackgen.commands.hints import did_you_mean
 from stackgen.commands.old_names import renew
 from stackgen.commands.output import FORMS, chosen, telling
@@ -211,11 +213,12 @@ class Command:
         values.pop("config", None)
         form = chosen(values.pop("json", False), values.pop("quiet", False))
         text = parser.dump(values, skip_unset=False) if self.config else ""
-        options = vars(parser.instantiate(values))
+        with blaming_values():
+            options = vars(parser.instantiate(values))
+            for name, kind in self.settings.items():
+                options[name] = kind(**{item.name: options.pop(item.name) for item in fields(kind)})
         if self.config:
             options[self.config] = text
-        for name, kind in self.settings.items():
-            options[name] = kind(**{item.name: options.pop(item.name) for item in fields(kind)})
         with telling(form):
             return self.function(**options)
 
@@ -267,7 +270,7 @@ def parse(parser: ArgumentParser, verb: str, argv: Sequence[str], own: ArgumentP
     except _refusals() as error:
         text = str(error).replace(f"required: {verb}.", "required: ")
         raise StackgenError(
-            f"{_shorten(text)}{did_you_mean(own or parser, text)}; see `stackgen {verb} --help`"
+            f"{shorten(text)}{did_you_mean(own or parser, text)}; see `stackgen {verb} --help`"
         ) from error
 
 
@@ -276,6 +279,21 @@ def _refusals() -> tuple[type[Exception], ...]:
     from omegaconf.errors import OmegaConfBaseException
 
     return ArgumentError, OmegaConfBaseException
+
+
+@contextmanager
+def blaming_values() -> Iterator[None]:
+    """Say in one line that constructors cannot do with the values that they were given.
+
+    Raises:
+        StackgenError: If they cannot.
+    """
+    try:
+        yield
+    except (TypeError, ValueError, AttributeError, OverflowError, LookupError) as error:
+        if explain(error) is not None:  # a line of its own
+            raise
+        raise StackgenError(f"the configuration cannot be used: {shorten(str(error))}") from error
 
 
 def own_sections(verb: str, argv: Sequence[str]) -> list[str]:
@@ -338,10 +356,10 @@ _NOISE = re.compile(
 )
 
 
-def _shorten(message: str, limit: int = 300) -> str:
+def shorten(message: str, limit: int = 300) -> str:
     """Shorten jsonargparse's paragraphs to one line.
 
-    >>> _shorten("Parser key 'data.mode':\\n  Errors:\\n  - Expected a float. Got value: q\\n  - Expected a path but q")
+    >>> shorten("Parser key 'data.mode':\\n  Errors:\\n  - Expected a float. Got value: q\\n  - Expected a path but q")
     'data.mode: Expected a float. Got value: q'
     """
     lines = [line.strip() for line in message.splitlines() if line.strip() and not _NOISE.match(line.strip())]

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import io
 import math
+import struct
+import tokenize
 import zipfile
+import zlib
 from typing import Any
 
 import numpy as np
@@ -13,6 +16,12 @@ from numpy.typing import NDArray
 _LARGE = 2**30
 _RATIO = 200
 """What is unpacked may be so many times as large as the file, or `_LARGE` [byte]; silhouettes pack twentyfold."""
+
+_DAMAGED = (
+    *(zlib.error, struct.error, tokenize.TokenError, SyntaxError, EOFError),
+    *(LookupError, TypeError, ValueError, RuntimeError, OverflowError, OSError),
+)
+"""What zipfile and numpy raise at bytes that are not as they were written."""
 
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -24,10 +33,11 @@ def read_npy(content: bytes) -> NDArray[Any]:
         ValueError: If it is none, holds objects, or its header promises other than is there.
     """
     file = io.BytesIO(content)
-    version = np.lib.format.read_magic(file)
-    if version not in _HEADERS:
-        raise ValueError(f"numpy's format {version} is not read here")
-    shape, _, kind = _HEADERS[version](file)
+    try:
+        version = np.lib.format.read_magic(file)
+        shape, _, kind = _HEADERS[version](file)
+    except _DAMAGED as error:
+        raise ValueError(f"no array that is read here: {' '.join(str(error).split())}") from error
     if kind.hasobject or math.prod(shape) * kind.itemsize != len(content) - file.tell():
         raise ValueError(f"an array {kind} {shape} in {len(content) - file.tell()} bytes")
     file.seek(0)
@@ -44,4 +54,11 @@ def read_npz(content: bytes) -> dict[str, NDArray[Any]]:
         size = sum(member.file_size for member in archive.infolist())
         if size > max(_LARGE, _RATIO * len(content)):
             raise ValueError(f"{size} bytes are packed into {len(content)}")
-        return {name.removesuffix(".npy"): read_npy(archive.read(name)) for name in archive.namelist()}
+        return {name.removesuffix(".npy"): read_npy(_unpacked(archive, name)) for name in archive.namelist()}
+
+
+def _unpacked(archive: zipfile.ZipFile, name: str) -> bytes:
+    try:
+        return archive.read(name)
+    except _DAMAGED as error:
+        raise ValueError(f"{name} is damaged: {' '.join(str(error).split())}") from error
