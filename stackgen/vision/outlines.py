@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.vision.lines import without_ground
-from stackgen.vision.masks import bounding_box, components, largest, opened, touches_edge
+from stackgen.vision.masks import bounding_box, closed, components, largest, opened, touches_edge
 from stackgen.world import Mask
 
 Ints = NDArray[np.int64]
@@ -27,6 +27,9 @@ GAPS = (0.0, 0.008, 0.016, 0.03, 0.05)
 
 STROKE = 0.13
 """A stroke is at most so wide, by the size of the drawing; what is wider is solid."""
+
+HATCH = 0.02
+"""Half of what lies between the strokes of a hatch, at most, by the size of the drawing."""
 
 LEAST_FACE = 0.012
 """Faces under this share of the drawing's box are flecks, and filled."""
@@ -93,6 +96,7 @@ def fill(ink: Mask) -> Filled:
 
 def _mended(ink: Mask, size: int) -> Filled:
     """Fill ink, closing the least gaps that enclose most; draw a base line where it alone is missing."""
+    ink = _hatched(ink, size)
     best = _least_gap(ink, size)
     if best.loose <= LOOSE:
         return _told(best, "", 1.0)
@@ -153,6 +157,16 @@ def _trial(ink: Mask, size: int, gap: float) -> _Trial:
         whole |= opened(drawn, 0.95 * stroke)
     enclosed = int(faces.areas[large].sum())
     return _Trial(whole, stroke, _loose(faces.ink, whole, stroke), gap, enclosed, doors)
+
+
+def _hatched(ink: Mask, size: int) -> Mask:
+    """Close hatches: strokes so dense that what they cover is solid; other ink stays as it is."""
+    dense = closed(ink, HATCH * size)
+    solid = opened(dense, 0.05 * size)
+    hatched = np.count_nonzero(solid) > 0.5 * np.count_nonzero(dense) and np.count_nonzero(
+        ink
+    ) > 0.4 * np.count_nonzero(dense)
+    return dense if hatched else ink
 
 
 def _bridged(ink: Mask, reach: float) -> Mask:
@@ -336,7 +350,13 @@ def choose(ink: Mask, which: int | None = None, spread: bool = False) -> Filled:
     groups = _groups(ink)
     found = [_one(group) for group in groups]
     drawings = [part for part in found if isinstance(part, Filled)]
-    refused = {_width(group): part for group, part in zip(groups, found, strict=True) if not isinstance(part, Filled)}
+    refused = {
+        _width(group): part
+        for group, part in zip(groups, found, strict=True)
+        if not isinstance(part, Filled) and (spread or not touches_edge(group, len(ink) // 60))
+    }
+    if not drawings and not refused:
+        raise StackgenError("nothing but what runs off the sheet is seen; leave some blank paper around the drawing")
     if refused and (not drawings or max(refused) > max(_width(part.mask) for part in drawings)):
         raise refused[max(refused)]  # never a name beside an outline that is open
     if not spread:
@@ -387,11 +407,12 @@ def _groups(ink: Mask) -> list[Mask]:
 def _one(group: Mask) -> Filled | StackgenError:
     """Fill one group of ink, without the ground line under it; the error if its outline is open."""
     note = "The ground line was left out."
+    bodies = [filled for filled in map(_filled, without_ground(group)) if filled is not None]
+    sure = [filled for filled in bodies if filled.sureness > 0.93]
+    if bodies:
+        chosen = sure[0] if sure else max(bodies, key=lambda filled: filled.sureness)
+        return replace(chosen, notes=(*chosen.notes, note))
     try:
-        for body in without_ground(group):
-            filled = _filled(body)
-            if filled is not None and filled.sureness > 0.93:
-                return Filled(filled.mask, filled.stroke, (*filled.notes, note), filled.sureness)
         return fill(group)
     except StackgenError as error:
         return error
