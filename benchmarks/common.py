@@ -26,7 +26,7 @@ from stackgen.io.files import write_json
 
 ROOT = Path(__file__).parents[1]
 FORMAT = "stackgen.benchmark/1"
-PACKAGES = ("stackgen", "numpy", "torch", "lightning", "pybullet")
+PACKAGES = ("stackgen", "numpy", "torch", "lightning", "pybullet", "mujoco")
 
 
 @dataclass(frozen=True)
