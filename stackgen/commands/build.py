@@ -111,6 +111,8 @@ def main(
             raise StackgenError("--as, --which, --depth_scale, --focal and --cell_size go with --from_image")
         content = _from_file(file, wanted)
     else:
+        if real.yes:
+            raise StackgenError("a real arm asks before it moves for a picture: leave out --yes")
         content = _from_image(wanted.from_image, file, wanted, picture)
     physics = replace(Physics.recorded(content.physics), cell_size=content.cell_size)
     with progress_bar("plan", len(content.stacks[0])) as (advance, say):
@@ -193,6 +195,7 @@ def _from_image(image: Path, file: Path | None, wanted: Wanted, picture: Picture
             inventory=wanted.inventory,
             budget=wanted.budget,
             seed=wanted.seed,
+            most=len(wanted.cell.staging.slots),
             on_step=lambda: advance(next(done)),
         )
     assert found.block_list is not None and found.target is not None
@@ -297,7 +300,7 @@ COMMAND = Command(
         "yes": "Do not ask before the real arm moves.",
         "resume": "Continue a real build that was interrupted with its next block.",
     },
-    hidden=("cell", "controller", "gripper"),
+    hidden=("cell", "controller", "gripper", "depth_scale", "focal", "cell_size"),
 )
 
 

@@ -232,7 +232,8 @@ class Command:
             if all(action.help == argparse.SUPPRESS for action in group._group_actions):
                 group.title = group.description = None
         if hidden:
-            names = ", ".join(f"--{name}.*" for name in self.hidden)
+            grouped = {action.dest.partition(".")[0] for action in hidden if "." in action.dest}
+            names = ", ".join(f"--{name}.*" if name in grouped else f"--{name}" for name in self.hidden)
             more = f"`{parser.prog} {HELP_OF_ALL}` shows {len(hidden)} more options: {names}"
             parser.epilog = f"{parser.epilog}\n\n{more}"
 

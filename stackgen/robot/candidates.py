@@ -17,6 +17,9 @@ from stackgen.vision.reader import Reading, filling, place
 NUMBER = 3
 """Stacks that stand which are looked for in a picture: the first of them may have no safe order."""
 
+SCALES = (5, 4, 3)
+"""Heights [cell] that are tried for a picture whose stacks are of too many blocks."""
+
 
 def stacks_of_picture(
     reading: Reading,
@@ -26,6 +29,7 @@ def stacks_of_picture(
     inventory: str | None = None,
     budget: str | None = None,
     seed: int = 0,
+    most: int | None = None,
     on_step: Callable[[], None] = lambda: None,
 ) -> StacksFile:
     """Find stacks for what is in a picture, and keep those that stand, the best first.
@@ -38,6 +42,8 @@ def stacks_of_picture(
         inventory: Blocks that there are, such as `cube=4,rectangle=3`.
         budget: Time such as `5s` that finding a stack may cost; for a model also a number of draws.
         seed: Seed of the stacks.
+        most: Number of blocks that there is room for where the robot takes them from: of a picture for which a stack
+            needs more the next smaller scale is tried.
         on_step: Called at most `NUMBER + 1` times, as the work proceeds.
 
     Raises:
@@ -48,12 +54,16 @@ def stacks_of_picture(
         if limit is not None and limit.seconds is None:
             raise StackgenError(f"--budget {budget} is a number of draws, which limits a model's samples; give a time")
         search = SearchSettings(seconds=None if limit is None else limit.seconds)
-        found = best(reading, NUMBER, seed, inventory=inventory, search=search, on_step=on_step)
+        for cells in ("auto", *map(str, SCALES)):
+            found = best(reading, NUMBER, seed, inventory=inventory, cells=cells, search=search, on_step=on_step)
+            if most is None or any(len(stack) <= most for stack in found.stacks):
+                break
     else:
         grid, figure = model.world.grid, reading.figure
         target = place(figure, grid, filling(figure, grid)) if reading.exact is None else reading.exact
         found = model.sample_verified(target, NUMBER, seed, inventory=inventory, budget=limit, on_step=on_step)
     standing = tuple(entry for entry in found.entries if entry.verdict is not None and entry.verdict.stable)
+    standing = tuple(entry for entry in standing if most is None or len(entry.stack) <= most) or standing
     if not standing:
         raise StackgenError(f"{name}: none of the stacks that were tried stands; try a larger --budget")
     return replace(found, entries=standing, silhouette=name)

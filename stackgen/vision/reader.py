@@ -87,8 +87,8 @@ class PictureOptions:
     """What the user says of a picture, as arguments of :func:`read_picture`.
 
     Args:
-        as_: What to take the picture for: a drawing, the photo of a sketch, or a depth frame; told apart by default.
-        which: Number of the drawing to read, from the left, where there are several.
+        as_: What to take the picture for; told by default.
+        which: Number of the drawing, from the left, where there are several.
         depth_scale: Metres of a step of a depth frame's values, such as 0.00025; by default whole numbers are
             millimetres and others are metres.
         focal: Focal length of a depth frame [pixel]; that of a RealSense D435 by default.
