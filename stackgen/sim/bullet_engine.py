@@ -42,6 +42,8 @@ class _Bullet:
     """PyBullet, imported when something of it is first asked for: what only plans, or prints a help, does without."""
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):  # asked of any object by who looks around in a module
+            raise AttributeError(name)
         try:
             with _quiet():
                 import pybullet
