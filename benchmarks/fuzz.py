@@ -302,12 +302,13 @@ class Worker:
         self.process = context.Process(target=_work, args=(there,), daemon=True)
         self.process.start()
         there.close()
-        self.fresh = True
+        self.known = set[str]()
 
     def give(self, kind: str, seed: int) -> tuple[str, str]:
         """Try one input."""
         self.pipe.send((kind, seed))
-        limit, self.fresh = SECONDS + (60.0 if self.fresh else 0.0), False  # the first loads torch and the rest
+        limit = SECONDS + (60.0 if kind not in self.known else 0.0)  # the first of a kind loads torch and the rest
+        self.known.add(kind)
         if not self.pipe.poll(limit):
             self._end()
             return "hang", f"over {limit:g} s"

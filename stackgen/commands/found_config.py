@@ -40,9 +40,11 @@ def taken_from(content: Any, path: Path, typed: Collection[str], sections: Colle
     Raises:
         StackgenError: If they name foreign classes, commands, places afar or folders to write to.
     """
-    if not isinstance(content, dict) or not isinstance(content.get("model"), dict):
+    groups = content if isinstance(content, dict) else {}
+    parts = [groups.get("model"), groups.get("data", {}), groups.get("trainer", {})]
+    if not all(isinstance(part, dict) for part in parts):
         raise StackgenError(f"{path} is no configuration of a run; name one with --config")
-    taken = {name: _without(value, typed, name) for name, value in content.items() if name in sections}
+    taken = {name: _without(value, typed, name) for name, value in groups.items() if name in sections}
     for place, value in _leaves(taken):
         reason = _foreign(place, value, path)
         if reason:

@@ -13,7 +13,7 @@ from stackgen.data.manifest import Split
 from stackgen.evaluation.protocol import BATCH, batch_seed, block_lists_of, draw
 from stackgen.evaluation.requests import Method
 from stackgen.io.stacks_file import StackEntry, StacksFile, write_stacks
-from stackgen.training.runs import RUNS
+from stackgen.training.runs import RUNS, dropped_if_failing
 
 
 def main(
@@ -53,7 +53,7 @@ def main(
     model = loaded.model
     request = loaded.requests(None, num_samples, seed, predicted_lists=predicted_lists, batch_size=batch_size)[-1]
     folder = open_run(name, runs, "predict", config, dataset)
-    with progress_bar("scenes", len(scenes)) as (advance, _):
+    with dropped_if_failing("[0-9]*.json", folder), progress_bar("scenes", len(scenes)) as (advance, _):
         for number, start in enumerate(range(0, len(scenes), batch_size)):
             batch = scenes[start : start + batch_size]
             block_lists, _ = block_lists_of(request, batch)

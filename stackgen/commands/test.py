@@ -19,7 +19,7 @@ from stackgen.evaluation.tables import list_table, metrics_table
 from stackgen.io.provenance import code_version
 from stackgen.io.text import read_json
 from stackgen.sim.other_physics import warn_of_other_physics
-from stackgen.training.runs import RUNS
+from stackgen.training.runs import RUNS, dropped_if_failing
 
 
 def main(
@@ -69,14 +69,17 @@ def main(
     requests.append(Request.ground_truth(dataset.world, facts))
     folder = open_run(name, runs, "test", config, dataset)
     found: list[Evaluation] = []
-    with simulating(loaded.model.physics, workers) as checker:
+    with dropped_if_failing(f"{PREFIX}*.json", folder), simulating(loaded.model.physics, workers) as checker:
         physics = checker.physics.to_json()
         learnt = (loaded.model.sampler.card.get("dataset") or {}).get("physics")
         warn_of_other_physics(f"dataset {dataset.path}", manifest.physics, physics)
         warn_of_other_physics(f"what {requests[0].method} learnt from", learnt, physics)
         with progress_bar("scenes", len(requests) * len(scenes)) as (advance, _):
             for number, request in enumerate(requests):
-                found.append(evaluate(request, scenes, checker, after(number * len(scenes), advance)))
+                try:
+                    found.append(evaluate(request, scenes, checker, after(number * len(scenes), advance)))
+                except KeyboardInterrupt:
+                    raise KeyboardInterrupt(_how_to_go_on(number, len(requests), folder)) from None
                 question = question_of(request, manifest.sha256, len(scenes), physics)
                 kind = request.block_list if request.sampler else "ground-truth"
                 write_evaluation(folder / f"{PREFIX}{kind}.json", found[-1], question)
@@ -87,6 +90,14 @@ def main(
     lists = list_table(found)
     tell(metrics_table(found), *([] if lists is None else [lists]), **read_json(folder / "metrics.json"))
     wrote(folder / "metrics.json")
+
+
+def _how_to_go_on(done: int, parts: int, folder: Path) -> str:
+    """Say what a test that was stopped leaves behind."""
+    if not done:
+        return "nothing is kept yet; the same command begins again"
+    kept = f"{done} of {parts} parts are kept in {folder}, where `stackgen report` finds them"
+    return f"{kept}; the same command begins again"
 
 
 COMMAND = Command(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,8 @@ import yaml
 
 from stackgen.commands.asking import from_old_layout, is_old_layout
 from stackgen.commands.test import COMMAND
+from stackgen.errors import StackgenError
+from stackgen.evaluation.protocol import evaluate
 from stackgen.evaluation.results import read_evaluation
 from stackgen.models.weights import CHECKPOINT_KEY, read_weights
 from tests.conftest import Cli, TinyWeights
@@ -154,3 +158,36 @@ def test_text_for_weights_is_refused_in_one_line(cli: Cli, here: Path) -> None:
     Path("bad.ckpt").write_text("class_path: os.system")
     answer = cli("test", "--weights", "bad.ckpt")
     assert answer.code == 2 and "bad.ckpt holds no weights" in answer.line
+
+
+@pytest.mark.parametrize(("struck", "kept"), [(0, False), (1, True)])
+def test_a_stopped_test_keeps_what_is_done_and_says_where(
+    struck: int, kept: bool, cli: Cli, here: Path, towers_dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = iter(range(9))
+
+    def evaluated(*arguments: Any) -> Any:
+        if next(calls) == struck:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return evaluate(*arguments)
+
+    monkeypatch.setattr("stackgen.commands.test.evaluate", evaluated)
+    answer = cli("test", "--weights", "random-placement", "--test_set", towers_dataset, "--predicted_lists", "false")
+    assert answer.code == 143 and "terminated" in answer.err and "the same command begins again" in answer.err
+    assert ("are kept in runs/run/test_0" in answer.err) is kept is Path("runs/run/test_0").exists()
+
+
+def test_a_test_that_fails_leaves_no_run_folder(
+    cli: Cli, here: Path, towers_dataset: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def failing(*_: object) -> None:
+        raise StackgenError("no")
+
+    monkeypatch.setattr("stackgen.commands.test.evaluate", failing)
+    assert cli("test", "--weights", "random-placement", "--test_set", towers_dataset).code == 2
+    assert not Path("runs").exists()
+
+
+def test_options_of_training_are_refused(cli: Cli, here: Path) -> None:
+    answer = cli("test", "--data.path", "x")
+    assert answer.code == 2 and "--data.path" in answer.err
