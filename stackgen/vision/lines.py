@@ -144,6 +144,18 @@ def without_ground(ink: Mask) -> list[Mask]:
         Nothing where there is none; else the ink (H, W) without it, and without only what is beside the drawing, as
         what stands on the line may have no line of its own there.
     """
+    body, foot = _off_ground(ink)
+    if foot is None:
+        return []
+    body, again = _off_ground(body)  # beyond a drawing that is filled in the line is found anew
+    foot = again or foot
+    under = body.copy()
+    under[:, foot[1]] = ink[:, foot[1]]
+    return [body, under]
+
+
+def _off_ground(ink: Mask) -> tuple[Mask, tuple[slice, slice] | None]:
+    """Remove the ground line that begins at one free end; return the rest and its box, None where there is none."""
     rows, columns = bounding_box(ink)
     size = max(rows.stop - rows.start, columns.stop - columns.start)
     lowest, thick, alone = _lowest_runs(ink, round(0.2 * size))
@@ -152,25 +164,29 @@ def without_ground(ink: Mask) -> list[Mask]:
         if np.count_nonzero(free) < 0.025 * size:
             continue
         path, width = _followed(ink, lowest, thick, free)
-        body = ink.copy()
-        reach = max(2, round(0.75 * width))
-        for column, row in enumerate(path):
-            if row < 0:
-                continue
-            top, bottom = max(0, row - reach), min(len(ink), row + reach + 1)
-            run = np.count_nonzero(ink[max(0, top - reach) : bottom + reach, column])
-            if run <= 1.7 * width + 1:
-                body[top:bottom, column] = False
+        body = _erased_along(ink, path, width)
         if not body.any():
             continue
         foot = bounding_box(body)
         long = np.count_nonzero(path >= 0) > 1.04 * (foot[1].stop - foot[1].start)
         below = foot[0].stop - 1 <= np.median(path[path >= 0]) + 0.06 * size
         if long and below and body.sum() > 0.3 * ink.sum():
-            under = body.copy()
-            under[:, foot[1]] = ink[:, foot[1]]
-            return [body, under]
-    return []
+            return body, foot
+    return ink, None
+
+
+def _erased_along(ink: Mask, path: NDArray[np.int64], width: float) -> Mask:
+    """Erase a line of some width along its row in each column (W,), where nothing else is with it."""
+    body = ink.copy()
+    reach = max(2, round(0.75 * width))
+    for column, row in enumerate(path):
+        if row < 0:
+            continue
+        top, bottom = max(0, row - reach), min(len(ink), row + reach + 1)
+        run = np.count_nonzero(ink[max(0, top - reach) : bottom + reach, column])
+        if run <= 1.7 * width + 1:
+            body[top:bottom, column] = False
+    return body
 
 
 def _lowest_runs(ink: Mask, room: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:

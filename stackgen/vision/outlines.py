@@ -408,7 +408,7 @@ def _one(group: Mask) -> Filled | StackgenError:
     """Fill one group of ink, without the ground line under it; the error if its outline is open."""
     note = "The ground line was left out."
     bodies = [filled for filled in map(_filled, without_ground(group)) if filled is not None]
-    sure = [filled for filled in bodies if filled.sureness > 0.93]
+    sure = [filled for filled in bodies if filled.sureness > 0.95]
     if bodies:
         chosen = sure[0] if sure else max(bodies, key=lambda filled: filled.sureness)
         return replace(chosen, notes=(*chosen.notes, note))
@@ -428,7 +428,7 @@ def _filled(ink: Mask) -> Filled | None:
 def _main_part(mask: Mask) -> Mask:
     """Keep the largest part of a mask and what is right beside it: a name is drawn near the structure, too."""
     rows, columns = bounding_box(mask)
-    return largest(mask, round(0.06 * max(rows.stop - rows.start, columns.stop - columns.start)))
+    return largest(mask, round(0.03 * max(rows.stop - rows.start, columns.stop - columns.start)))
 
 
 def _is_round(mask: Mask) -> bool:

@@ -209,7 +209,7 @@ def _of_photo(image: Image8, sheet: Sheet | None, which: int | None) -> Reading:
         raise StackgenError(f"the photo is only {width} x {height} pixels; take a larger one")
     page = read_page(image.colours, sheet)
     found = choose(page.ink, which)
-    if sheet is None and cv2.contourArea(_hull(found.mask)) > 0.55 * found.mask.size:
+    if sheet is None and not drawings.is_even(image) and cv2.contourArea(_hull(found.mask)) > 0.55 * found.mask.size:
         raise StackgenError(_UNCLEAR)
     if _runs_off(found):
         raise StackgenError("the drawing runs off the sheet; leave some blank paper around it")
