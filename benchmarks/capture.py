@@ -24,7 +24,7 @@ from stackgen.stack import Stack
 from stackgen.vision.cameras import Rig, simulated_frame
 from stackgen.vision.cells import in_cells
 from stackgen.vision.depth import find_structure
-from stackgen.vision.masks import fitted
+from stackgen.vision.masks import bounding_box, fitted
 from stackgen.world import PAPER_GRID, Mask
 
 KINDS = ("as seen", "in cells")
@@ -85,7 +85,7 @@ def case(stack: Stack, rng: np.random.Generator, model: Model) -> Case:
     seed = int(rng.integers(2**31))
     found = find_structure(simulated_frame(stack, rig, seed=seed))
     as_seen = fitted(found.front, PAPER_GRID)
-    in_whole, cells, _ = in_cells(as_seen, ALIKE, PAPER_GRID)
+    in_whole, cells, _ = in_cells(found.front[bounding_box(found.front)], ALIKE, PAPER_GRID)
     own = own_silhouette(stack)
     silhouettes = (as_seen, in_whole)
     best = [model.sample_verified(mask, 1, seed).entries[0] for mask in silhouettes]

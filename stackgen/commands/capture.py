@@ -131,7 +131,8 @@ def _found(reading: Reading, freehand: bool) -> tuple[Mask, list[str]]:
             )
         high = height
     as_seen = place(reading.figure, PAPER_GRID, high) if reading.exact is None else reading.exact
-    silhouette, cells, block_list = in_cells(as_seen, _ALIKE[reading.kind], PAPER_GRID)
+    known = None if reading.cell is None else high
+    silhouette, cells, block_list = in_cells(reading.figure, _ALIKE[reading.kind], PAPER_GRID, known)
     return (as_seen if freehand else silhouette), [*lines, *_made_of(cells, block_list)]
 
 

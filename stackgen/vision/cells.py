@@ -5,6 +5,7 @@ Legend: H x W pixels, rows and columns of cells from the lower left, S shapes.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import cv2
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from stackgen.geometry import iou
 from stackgen.vision.drawings import grid_offset
-from stackgen.vision.masks import bounding_box, fitted
+from stackgen.vision.masks import bounding_box, filling, place
 from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, Grid, Mask
 
 Ints = NDArray[np.int64]
@@ -24,24 +25,46 @@ EMPTY, FULL, TRIANGLE = range(3)
 NEAR = 0.3
 """The sides of a structure of whole cells are at most this far from whole numbers [cell]."""
 
+CLEARLY = 0.9
+"""Least IoU with cells at less than the largest scale, which are fewer and suit by chance."""
 
-def in_cells(as_read: Mask, alike: float, grid: Grid) -> tuple[Mask, Ints | None, Ints | None]:
-    """Replace a silhouette by that of the cells it is made of, where it is made of whole cells.
+
+def in_cells(
+    figure: Mask, alike: float, grid: Grid, high: float | None = None
+) -> tuple[Mask, Ints | None, Ints | None]:
+    """Replace a figure by the cells it is made of, where it is made of whole cells.
+
+    Its scale is that at which it is most alike: three steps are three cells high, though the grid has four. Of scales
+    that are equally good the largest counts.
 
     Args:
-        as_read: (H, W) silhouette on the grid, anywhere between its cell lines, not empty.
-        alike: Least IoU of the cells' picture with the stretched silhouette for it to count as made of whole cells.
+        figure: (h, w), cut out to its box.
+        alike: Least IoU of the cells' picture with the stretched figure for it to count as made of whole cells.
         grid: Grid of the silhouette.
+        high: Height of the figure [cell] where it is known.
 
     Returns:
-        (H, W) silhouette, (rows, columns) cells and (S,) block list; without whole cells `as_read`, None and None.
+        (H, W) silhouette, (rows, columns) cells and (S,) block list; without whole cells the figure as it fills the
+        grid, or as high as it is known to be, None and None.
     """
+    full = filling(figure, grid) if high is None else high
+    heights = [full, *range(math.ceil(full) - 1, 0, -1)] if high is None else [full]
+    tried = [_as_cells(place(figure, grid, height), grid) for height in heights]
+    best, cells = tried[0]
+    for score, fewer in tried[1:]:
+        if score >= max(CLEARLY, best + 0.03):
+            best, cells = score, fewer
+    if best < alike:
+        return place(figure, grid, full), None, None
+    whole, rows = picture_of(cells, grid), int((cells != EMPTY).any(axis=1).sum())
+    return place(whole[bounding_box(whole)], grid, rows), cells, block_list_of(cells)
+
+
+def _as_cells(as_read: Mask, grid: Grid) -> tuple[float, Ints]:
+    """Find the cells nearest to a silhouette (H, W), and how alike their picture is."""
     picture = stretched(as_read, grid)
     cells = occupancy(picture, grid)
-    whole = picture_of(cells, grid)
-    if iou(whole, picture) < alike:
-        return as_read, None, None
-    return fitted(whole, grid), cells, block_list_of(cells)
+    return iou(picture_of(cells, grid), picture), cells
 
 
 def stretched(silhouette: Mask, grid: Grid) -> Mask:

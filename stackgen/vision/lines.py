@@ -1,4 +1,7 @@
-"""Lines that are no part of a drawing: those of ruled and squared paper, and the ground that a structure stands on.
+"""Lines that are no part of a drawing, and lines that it lacks.
+
+The former are those of ruled and squared paper, and the ground that a structure stands on; the latter close gaps,
+hatches and what has no base line.
 
 Legend: H x W pixels.
 """
@@ -9,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.vision.masks import bounding_box, components
+from stackgen.vision.masks import bounding_box, closed, components, opened
 from stackgen.world import Mask
 
 Floats = NDArray[np.float64]
@@ -25,6 +28,9 @@ FAINTEST = 0.15
 
 SLOPE = 6.0
 """Lines of paper are level or upright to within this [deg]."""
+
+HATCH = 0.02
+"""Half of what lies between the strokes of a hatch, at most, by the size of the drawing."""
 
 _HAIR = 0.005  # greatest width of a line of paper, by the sheet's longer edge
 
@@ -232,3 +238,47 @@ def _followed(
                 path[column] = round(row)
             column += step
     return path, width
+
+
+def hatched(ink: Mask, size: int) -> Mask:
+    """Close hatches: strokes so dense that what they cover is solid; other ink stays as it is."""
+    dense = closed(ink, HATCH * size)
+    solid = opened(dense, 0.05 * size)
+    hatched = np.count_nonzero(solid) > 0.5 * np.count_nonzero(dense) and np.count_nonzero(
+        ink
+    ) > 0.4 * np.count_nonzero(dense)
+    return dense if hatched else ink
+
+
+def bridged(ink: Mask, reach: float) -> Mask:
+    """Draw lines across gaps in outlines of up to twice a reach [pixel].
+
+    What lies further from all ink than the reach tells inside from outside; where both meet there is a line.
+    """
+    blank, _ = components(~ink, connectivity=4)
+    outside = blank == blank[0, 0]
+    far = cv2.distanceTransform((~ink).astype(np.uint8), cv2.DIST_L2, 5) > reach
+    seeds, _ = components(far & outside, connectivity=4)
+    barrier = np.where(seeds > 0, 0, 1).astype(np.uint8)
+    _, nearest = cv2.distanceTransformWithLabels(barrier, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    of_pixel = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
+    of_pixel[nearest[seeds > 0]] = seeds[seeds > 0]
+    sides = of_pixel[nearest].astype(np.float32)
+    low, high = cv2.erode(sides, np.ones((3, 3), np.uint8)), cv2.dilate(sides, np.ones((3, 3), np.uint8))
+    return np.asarray(ink | ((low != high) & outside))
+
+
+def with_base(ink: Mask, size: int, stroke: float) -> Mask | None:
+    """Draw a line between the lowest ends of the strokes, None where they are too near to each other."""
+    rows, columns = np.nonzero(ink)
+    base = int(rows.max())
+    feet = columns[rows > base - 0.08 * size]
+    if np.ptp(feet) < 0.25 * np.ptp(columns):
+        return None
+    based = ink.astype(np.uint8)
+    ends = []
+    for end in (int(feet.min()), int(feet.max())):
+        near = (np.abs(columns - end) <= stroke) & (rows > base - 0.08 * size)
+        ends.append((end, int(rows[near].max())))
+    cv2.line(based, ends[0], ends[1], 1, max(1, round(stroke)))
+    return based > 0

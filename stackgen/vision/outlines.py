@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.vision.lines import without_ground
-from stackgen.vision.masks import bounding_box, closed, components, largest, opened, touches_edge
+from stackgen.vision.lines import bridged, hatched, with_base, without_ground
+from stackgen.vision.masks import bounding_box, components, largest, opened, touches_edge
 from stackgen.world import Mask
 
 Ints = NDArray[np.int64]
@@ -27,9 +27,6 @@ GAPS = (0.0, 0.008, 0.016, 0.03, 0.05)
 
 STROKE = 0.13
 """A stroke is at most so wide, by the size of the drawing; what is wider is solid."""
-
-HATCH = 0.02
-"""Half of what lies between the strokes of a hatch, at most, by the size of the drawing."""
 
 LEAST_FACE = 0.012
 """Faces under this share of the drawing's box are flecks, and filled."""
@@ -96,11 +93,11 @@ def fill(ink: Mask) -> Filled:
 
 def _mended(ink: Mask, size: int) -> Filled:
     """Fill ink, closing the least gaps that enclose most; draw a base line where it alone is missing."""
-    ink = _hatched(ink, size)
+    ink = hatched(ink, size)
     best = _least_gap(ink, size)
     if best.loose <= LOOSE:
         return _told(best, "", 1.0)
-    based = _with_base(ink, size, max(best.stroke, 2.0))
+    based = with_base(ink, size, max(best.stroke, 2.0))
     if based is not None:
         again = _least_gap(based, size)
         if again.loose <= LOOSE:
@@ -142,7 +139,7 @@ def _least_gap(ink: Mask, size: int) -> _Trial:
 
 
 def _trial(ink: Mask, size: int, gap: float) -> _Trial:
-    drawn = _bridged(ink, gap * size) if gap else ink
+    drawn = bridged(ink, gap * size) if gap else ink
     faces = _faces(drawn, size)
     box = faces.ink[bounding_box(faces.ink)].size
     doors, opening = _open_faces(faces, size)
@@ -157,34 +154,6 @@ def _trial(ink: Mask, size: int, gap: float) -> _Trial:
         whole |= opened(drawn, 0.95 * stroke)
     enclosed = int(faces.areas[large].sum())
     return _Trial(whole, stroke, _loose(faces.ink, whole, stroke), gap, enclosed, doors)
-
-
-def _hatched(ink: Mask, size: int) -> Mask:
-    """Close hatches: strokes so dense that what they cover is solid; other ink stays as it is."""
-    dense = closed(ink, HATCH * size)
-    solid = opened(dense, 0.05 * size)
-    hatched = np.count_nonzero(solid) > 0.5 * np.count_nonzero(dense) and np.count_nonzero(
-        ink
-    ) > 0.4 * np.count_nonzero(dense)
-    return dense if hatched else ink
-
-
-def _bridged(ink: Mask, reach: float) -> Mask:
-    """Draw lines across gaps in outlines of up to twice a reach [pixel].
-
-    What lies further from all ink than the reach tells inside from outside; where both meet there is a line.
-    """
-    blank, _ = components(~ink, connectivity=4)
-    outside = blank == blank[0, 0]
-    far = cv2.distanceTransform((~ink).astype(np.uint8), cv2.DIST_L2, 5) > reach
-    seeds, _ = components(far & outside, connectivity=4)
-    barrier = np.where(seeds > 0, 0, 1).astype(np.uint8)
-    _, nearest = cv2.distanceTransformWithLabels(barrier, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    of_pixel = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
-    of_pixel[nearest[seeds > 0]] = seeds[seeds > 0]
-    sides = of_pixel[nearest].astype(np.float32)
-    low, high = cv2.erode(sides, np.ones((3, 3), np.uint8)), cv2.dilate(sides, np.ones((3, 3), np.uint8))
-    return np.asarray(ink | ((low != high) & outside))
 
 
 def _without_whiskers(mask: Mask, size: int) -> Mask:
@@ -307,22 +276,6 @@ def _is_doorway(faces: _Faces, one: int, around: int) -> bool:
     middle = columns[(rows > top + 0.3 * (bottom - top))]
     sides = faces.labels[(top + bottom) // 2, [max(int(middle.min()) - 1, 0), int(middle.max()) + 1]]
     return bool((below == 0).mean() > 0.5 and (sides == around).all())
-
-
-def _with_base(ink: Mask, size: int, stroke: float) -> Mask | None:
-    """Draw a line between the lowest ends of the strokes, None where they are too near to each other."""
-    rows, columns = np.nonzero(ink)
-    base = int(rows.max())
-    feet = columns[rows > base - 0.08 * size]
-    if np.ptp(feet) < 0.25 * np.ptp(columns):
-        return None
-    based = ink.astype(np.uint8)
-    ends = []
-    for end in (int(feet.min()), int(feet.max())):
-        near = (np.abs(columns - end) <= stroke) & (rows > base - 0.08 * size)
-        ends.append((end, int(rows[near].max())))
-    cv2.line(based, ends[0], ends[1], 1, max(1, round(stroke)))
-    return based > 0
 
 
 RIVAL = 0.2

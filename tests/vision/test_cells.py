@@ -8,7 +8,7 @@ import pytest
 from stackgen.geometry import silhouette
 from stackgen.stack import Stack
 from stackgen.vision.cells import EMPTY, FULL, TRIANGLE, block_list_of, in_cells, occupancy, picture_of
-from stackgen.vision.masks import fitted
+from stackgen.vision.masks import bounding_box, fitted
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID
 
 
@@ -26,8 +26,8 @@ def test_blocks_that_stick_out_of_the_grid_make_no_triangles() -> None:
     long, cells = PAPER_CATALOGUE.index("long_rectangle"), np.array([[1, 1, 1, 0], [0, 1, 1, 1]] * 2)
     xs = [-0.65, 0.6, -0.5, 0.6]
     poses = np.array([[x, 0, row + 0.5, 0, 0, 0] for row, x in enumerate(xs)])
-    as_read = fitted(silhouette(Stack(np.full(4, long), poses), PAPER_GRID), PAPER_GRID)
-    whole, found, _ = in_cells(as_read, 0.85, PAPER_GRID)
+    seen = silhouette(Stack(np.full(4, long), poses), PAPER_GRID, margin=10)
+    whole, found, _ = in_cells(seen[bounding_box(seen)], 0.85, PAPER_GRID)
     assert found is not None and found.tolist() == cells.tolist()
     assert np.array_equal(whole, picture_of(cells, PAPER_GRID))
 
@@ -39,3 +39,19 @@ def test_blocks_that_stick_out_of_the_grid_make_no_triangles() -> None:
 def test_the_heuristic_takes_the_longest_blocks_that_fit(row: list[int], counts: list[int] | None) -> None:
     found = block_list_of(np.array([row]))
     assert (None if found is None else found.tolist()) == counts
+
+
+@pytest.mark.parametrize("steps", [3, 4])
+def test_steps_keep_their_number(steps: int) -> None:
+    figure = np.kron(np.tril(np.ones((steps, steps), dtype=bool)), np.ones((50, 50), dtype=bool))
+    whole, cells, _ = in_cells(figure, 0.85, PAPER_GRID)
+    expected = np.tril(np.ones((steps, steps), dtype=int))[::-1]
+    assert cells is not None and np.array_equal(cells[:steps, :steps] > 0, expected > 0)
+    assert whole.any(axis=1).sum() == 14 * steps
+
+
+def test_what_is_not_made_of_whole_cells_stays_as_seen() -> None:
+    rows, columns = np.mgrid[-1:1:200j, -1:1:200j]
+    disc = rows**2 + columns**2 < 1
+    whole, cells, block_list = in_cells(disc, 0.95, PAPER_GRID)
+    assert np.array_equal(whole, fitted(disc, PAPER_GRID)) and cells is None and block_list is None
