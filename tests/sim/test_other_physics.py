@@ -45,10 +45,10 @@ def test_fit_says_so_once_if_the_data_are_of_other_physics(
     monkeypatch.chdir(tmp_path)
     shutil.copytree(towers_dataset, "data")
     manifest = Dataset.open("data").manifest
-    replace(manifest, physics={**manifest.physics, "solver_iterations": 20}).save(Path("data"))
+    replace(manifest, physics={**manifest.physics, "watch": 3.0}).save(Path("data"))
     Path("tiny.yaml").write_text(TINY)
     with pytest.warns(UserWarning, match="other physics") as caught:
         answer = cli("fit", "--config", "tiny.yaml", "--data.path", "data")
     assert answer.code == 0, answer.err
     lines = [str(warning.message) for warning in caught if "physics" in str(warning.message)]
-    assert lines == ["dataset data was made with other physics than are used here: solver_iterations 20 instead of 60"]
+    assert lines == ["dataset data was made with other physics than are used here: watch 3.0 instead of 2.0"]

@@ -137,7 +137,8 @@ def _head(conditions: Conditions) -> str:
     partly = conditions.scenes < conditions.all_scenes
     number = f"**The first {conditions.scenes} of {conditions.all_scenes}**" if partly else conditions.scenes
     physics = conditions.physics
-    numbers = ", ".join(f"{name} {value:.6g}" for name, value in physics.items() if name != "engine")
+    plain = {name: value if isinstance(value, str) else f"{value:.6g}" for name, value in physics.items()}
+    numbers = ", ".join(f"{name} {value}" for name, value in plain.items() if name != "engine")
     parts = [
         "# The paper's table, every row",
         f"`stackgen report` writes this page and overwrites what is changed here by hand. Code {conditions.code}.",
