@@ -310,7 +310,7 @@ class _Search:
                 if begin.blocks and (begin.top > level).any():
                     grown.append(begin)
             beginnings = self._keep(grown, level + 1, width)
-            if self.late:
+            if not beginnings or self.late:
                 break
         ends += beginnings
         done = [end for end in ends if end.blocks and not (self.given and any(end.left))]

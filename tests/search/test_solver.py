@@ -99,6 +99,15 @@ def test_the_sampler_answers_whatever_it_is_asked() -> None:
     assert SearchBlockLists().predict(target[None], top=2)[0, 0].tolist() == [1, 0, 0, 0]
 
 
+def test_an_inventory_that_ends_before_the_silhouette_gives_what_it_can_or_nothing() -> None:
+    planks = World(Catalogue((Shape.box("cube", 1), Shape.box("plank", 3, 0.5))), PAPER_GRID, 10)
+    for inventory in ([1, 0], [0, 1]):
+        for answer in solve(TARGET, planks, 3, inventory=np.array(inventory)):
+            assert (answer.stack.counts <= inventory).all()
+    tall = silhouette(Stack(np.zeros(4, int), np.array([[0, 0, z + 0.5, 0, 0, 0] for z in range(4)])), PAPER_GRID)
+    assert solve(tall, PAPER_WORLD, 3, inventory=np.array([0, 0, 0, 1]))[0].stack.counts.tolist() == [0, 0, 0, 1]
+
+
 def test_bad_input_is_one_line() -> None:
     with pytest.raises(StackgenError, match="nothing is set"):
         solve(np.zeros((64, 64), dtype=bool), PAPER_WORLD)
