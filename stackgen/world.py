@@ -30,6 +30,9 @@ MOST_SHAPES = 127
 """Shapes of a catalogue, at most: datasets count them in a signed byte."""
 
 
+_MOST_CELLS = 1000
+
+
 @dataclass(frozen=True)
 class Shape:
     """A convex prism: an outline in the (x, z) plane extruded along y.
@@ -61,6 +64,8 @@ class Shape:
         corners = np.asarray(self.outline, dtype=float)
         if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
             raise self._refused("must be at least three (x, z) corners, finite numbers")
+        if np.abs(corners).max() > _MOST_CELLS or self.depth > _MOST_CELLS:
+            raise StackgenError(f"shape {self.name!r}: outline and depth must lie within {_MOST_CELLS} cells")
         edges = np.roll(corners, -1, axis=0) - corners
         after = np.roll(edges, -1, axis=0)
         turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import io
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
@@ -264,15 +265,23 @@ def parse(parser: ArgumentParser, verb: str, argv: Sequence[str], own: ArgumentP
     Raises:
         StackgenError: On an unknown option or key, a missing or ill-typed value, a broken YAML file.
     """
+    told = io.StringIO()
     try:
-        return parser.parse_args(list(argv))
-    except SystemExit:  # after a help; nobody is to wait for the other kinds of errors
-        raise
+        with redirect_stderr(told):
+            return parser.parse_args(list(argv))
+    except SystemExit as stop:  # after a help; the parser of a class, which `--x.help` asks, prints its usage and exits
+        if not stop.code:
+            raise
+        line = told.getvalue().partition("error: ")[2]
+        told.truncate(0)
+        raise StackgenError(f"{shorten(line)}; see `stackgen {verb} --help`") from None
     except _refusals() as error:
         text = str(error).replace(f"required: {verb}.", "required: ")
         raise StackgenError(
             f"{shorten(text)}{did_you_mean(own or parser, text)}; see `stackgen {verb} --help`"
         ) from error
+    finally:
+        sys.stderr.write(told.getvalue())
 
 
 def _refusals() -> tuple[type[Exception], ...]:

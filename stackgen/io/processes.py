@@ -8,11 +8,13 @@ import os
 import signal
 import threading
 from collections.abc import Iterator
+from multiprocessing import resource_tracker
 
 
 @contextlib.contextmanager
 def without_interrupts() -> Iterator[None]:
     """Keep Ctrl-C from the processes that start inside the block, from their first moment on."""
+    resource_tracker.ensure_running()  # multiprocessing's own helper: when it starts, it lets Ctrl-C through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
