@@ -337,7 +337,7 @@ def of_two_tones(values: NDArray[np.uint8]) -> bool:
     apart = float(ends[1] - ends[0])
     beside = max(float(np.abs(low - ends[0]).mean()), float(np.abs(high - ends[1]).mean()))
     beyond = (values < ends[0] - 0.35 * apart) | (values > ends[1] + 0.35 * apart)  # ink in a shadow is darker still
-    return bool(apart > 2 * _CONTRAST and beside < 0.085 * apart + 2 and beyond.mean() < 0.003)
+    return bool(apart > _CONTRAST and beside < 0.085 * apart + 2 and beyond.mean() < 0.003)
 
 
 def is_even(image: Image8) -> bool:

@@ -250,7 +250,7 @@ BAD: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "nearly one colour": (
         "a.png",
         lambda p: Image.fromarray(np.random.default_rng(0).integers(200, 215, (90, 90), dtype=np.uint8)).save(p),
-        "all one colour",
+        "nothing is drawn",
     ),
     "small": ("a.png", lambda p: Image.new("L", (7, 90)).save(p), "only 7 x 90 pixels"),
 }
