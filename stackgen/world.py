@@ -64,8 +64,8 @@ class Shape:
         corners = np.asarray(self.outline, dtype=float)
         if corners.ndim != 2 or corners.shape[0] < 3 or corners.shape[1] != 2 or not np.isfinite(corners).all():
             raise self._refused("must be at least three (x, z) corners, finite numbers")
-        if np.abs(corners).max() > _MOST_CELLS or self.depth > _MOST_CELLS:
-            raise StackgenError(f"shape {self.name!r}: outline and depth must lie within {_MOST_CELLS} cells")
+        if np.abs(corners).max() > _MOST_CELLS:
+            raise self._refused(f"must lie within {_MOST_CELLS} cells")
         edges = np.roll(corners, -1, axis=0) - corners
         after = np.roll(edges, -1, axis=0)
         turns = edges[:, 0] * after[:, 1] - edges[:, 1] * after[:, 0]
@@ -79,8 +79,10 @@ class Shape:
         middle = (corners.min(axis=0) + corners.max(axis=0)) / 2
         if np.abs(middle).max() > 5e-7:
             raise self._refused(f"must have its box centred on (0, 0); subtract ({middle[0]:g}, {middle[1]:g})")
-        if not 0 < self.depth < np.inf:
-            raise StackgenError(f"shape {self.name!r}: depth must be positive and finite, got {self.depth}")
+        if not 0 < self.depth <= _MOST_CELLS:
+            raise StackgenError(
+                f"shape {self.name!r}: depth must be positive and at most {_MOST_CELLS} cells, got {self.depth}"
+            )
 
     def _refused(self, reason: str) -> StackgenError:
         return StackgenError(f"shape {self.name!r}: the outline {reason}")
