@@ -72,7 +72,7 @@ def cli(*words: object) -> tuple[str, str]:
 
 def parsed_only(verb: str, *words: object) -> tuple[str, str]:
     """Run a verb whose function does nothing: what is tried is its parser, and the settings that it makes."""
-    module = importlib.import_module(f"stackgen.commands.{verb}")
+    module: Any = importlib.import_module(f"stackgen.commands.{verb}")
     before = module.COMMAND
     module.COMMAND = replace(before, function=_nothing_like(before.function))
     try:
@@ -212,7 +212,7 @@ def sweeps(folder: Path, rng: random.Random) -> tuple[str, str]:
         return parsed_only("sweep", "--config", _write(folder / "s.yaml", fuzzing.mutated_yaml(text, rng)))
     from stackgen.training.sweeps.file import Metric, Sweep
 
-    parameters = {"x": {"min": 0.0, "max": 1.0}, "y": {"values": [1, 2]}}
+    parameters: dict[str, dict[str, Any]] = {"x": {"min": 0.0, "max": 1.0}, "y": {"values": [1, 2]}}
     sweep = Sweep(program="x.py", name="s", parameters=parameters, metric=Metric(name="loss"))
     study = open_study(sweep, folder)
     for _ in range(3):

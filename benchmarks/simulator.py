@@ -50,7 +50,7 @@ def main() -> None:
         )
     ]
     metrics = {
-        **{physics.engine: physics.to_json() for physics in ENGINES},
+        **{str(physics.engine): physics.to_json() for physics in ENGINES},
         "speed": rows,
         "peak_rss_mb": peak_rss_mb(),
     }

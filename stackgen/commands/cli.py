@@ -39,7 +39,9 @@ VERBS: dict[str, Verb] = {
     "sample": Verb("stackgen.commands.sample", "turn silhouettes into stacks that stand"),
     "check": Verb("stackgen.commands.check", "simulate the structures of a file: which stand, which fall"),
     "show": Verb("stackgen.commands.show", "draw the structures of a file, as a picture and in 3-D"),
-    "capture": Verb("stackgen.commands.capture", "find the silhouette in a drawing, a photo of a sketch or a depth frame"),
+    "capture": Verb(
+        "stackgen.commands.capture", "find the silhouette in a drawing, a photo of a sketch or a depth frame"
+    ),
     "build": Verb("stackgen.commands.build", "build a structure with a UR5 and parallel jaws, simulated or real"),
     "generate": Verb("stackgen.commands.generate", "make a dataset by deconstruction"),
     "dataset": Verb("stackgen.commands.dataset", "verify, repair, describe, split or export a dataset"),

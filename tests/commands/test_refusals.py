@@ -62,7 +62,7 @@ def test_a_refusal_of_a_library_is_one_line(options: str, word: str, cli: Cli, t
 
 
 def test_a_mistake_of_ours_is_still_a_bug() -> None:
-    for wrong in (lambda: [][0], lambda: int("x"), lambda: {}["x"], lambda: None + 1):  # type: ignore[operator]
+    for wrong in (lambda: [][0], lambda: int("x"), lambda: {"y": 1}["x"], lambda: None + 1):  # type: ignore[operator]
         with pytest.raises(Exception) as caught:  # noqa: PT011
             wrong()
         assert explain(caught.value) is None

@@ -40,7 +40,7 @@ def test_the_command_line_s_reader_knows_bombs_too() -> None:
     from jsonargparse import get_loader
 
     for mode in ("yaml", "omegaconf+"):
-        _read_files_as(mode)  # type: ignore[arg-type]
+        _read_files_as(mode)
         with pytest.raises(ValueError, match="aliases"):
             get_loader(mode)(LAUGHS)
 

@@ -32,7 +32,7 @@ def photo_of(stack: Stack, **options: Any) -> np.ndarray:
     return photographed(sheet_with(stack, photo, cell=110), photo)
 
 
-PAPERS = {
+PAPERS: dict[str, dict[str, Any]] = {
     "flat": {"filled": True, "slant": 0, "turn": 0, "light": 0},
     "outline": {"style": "outline", "slant": 0.12, "turn": -8, "light": 0.5, "seed": 5},
     "shadow": {"shadow": 0.55, "softness": 6, "seed": 3},

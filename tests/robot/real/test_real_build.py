@@ -111,7 +111,7 @@ def test_there_must_be_something_to_go_on_with(tmp_path: Path) -> None:
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": "stackgen.build/1"}', '{"format": "other/1"}'])
 def test_a_broken_file_is_one_line(tmp_path: Path, text: str) -> None:
     (tmp_path / FILE).write_text(text)
-    with pytest.raises(StackgenError, match="is not (the progress of a build|JSON)"):
+    with pytest.raises(StackgenError, match=r"is not (the progress of a build|JSON)"):
         BuildProgress.read(tmp_path)
 
 
@@ -119,7 +119,7 @@ def test_an_impossible_number_of_blocks_is_one_line(tmp_path: Path) -> None:
     BuildProgress.of(TOWER, (0, 1), WORKCELL).write(tmp_path)
     plain = json.loads((tmp_path / FILE).read_text())
     (tmp_path / FILE).write_text(json.dumps({**plain, "placed": 3}))
-    with pytest.raises(StackgenError, match="is not (the progress of a build|JSON)"):
+    with pytest.raises(StackgenError, match=r"is not (the progress of a build|JSON)"):
         BuildProgress.read(tmp_path)
 
 
