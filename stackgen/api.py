@@ -19,9 +19,9 @@ from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.names import DEFAULT, CheckerName
 from stackgen.protocols import BlockListPredictor, StabilityChecker, StackSampler
 from stackgen.sampling.alignment import AlignedSampler
+from stackgen.search.problem import SearchSettings
 from stackgen.search.sampler import SearchSampler
 from stackgen.search.scale import MOST_BLOCKS, Cells
-from stackgen.search.solver import SearchSettings
 from stackgen.stack import Stack, check_block_list, parse_block_list
 from stackgen.vision.drawings import grid_offset
 from stackgen.vision.reader import Reading, read_picture, read_silhouette

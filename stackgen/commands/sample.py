@@ -60,8 +60,8 @@ def main(
     from stackgen.commands.sample_pictures import answer_all, of_model, result_folders
     from stackgen.io.stacks_file import StacksFile
     from stackgen.sampling.verified import Budget
+    from stackgen.search.problem import SearchSettings
     from stackgen.search.scale import Cells
-    from stackgen.search.solver import SearchSettings
     from stackgen.vision.reader import Reading
 
     if num_samples < 1:

@@ -10,7 +10,7 @@ from stackgen.errors import StackgenError
 from stackgen.io.stacks_file import StacksFile
 from stackgen.robot.build import PlannedBuild
 from stackgen.sampling.verified import Budget
-from stackgen.search.solver import SearchSettings
+from stackgen.search.problem import SearchSettings
 from stackgen.stack import Stack
 from stackgen.vision.reader import Reading, filling, place
 

@@ -16,8 +16,9 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
 from stackgen.protocols import StabilityChecker
 from stackgen.sampling.verified import Candidate, best
+from stackgen.search.problem import SearchSettings
 from stackgen.search.scale import Cells, Scaled, best_scale
-from stackgen.search.solver import SearchSettings, solve
+from stackgen.search.solver import solve
 from stackgen.stack import Stack, layout
 from stackgen.vision.reader import Reading
 from stackgen.world import Mask, World

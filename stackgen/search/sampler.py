@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.search.solver import SearchSettings, solve
+from stackgen.search.problem import SearchSettings
+from stackgen.search.solver import solve
 from stackgen.stack import Stack, check_block_list, shapes_of
 from stackgen.world import PAPER_WORLD, Mask, World
 

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
-from stackgen.search.solver import Answer, SearchSettings, solve
+from stackgen.search.problem import SearchSettings
+from stackgen.search.solver import Answer, solve
 from stackgen.vision.reader import place
 from stackgen.world import Grid, Mask, World
 

@@ -10,10 +10,11 @@ import pytest
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette, silhouette_iou
 from stackgen.search.balance import Balance
+from stackgen.search.problem import SearchSettings
 from stackgen.search.rows import Levels, Placed
 from stackgen.search.sampler import SearchBlockLists, SearchSampler
 from stackgen.search.scale import Cells, best_scale
-from stackgen.search.solver import SearchSettings, solve
+from stackgen.search.solver import solve
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.stack import Stack, layout
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Catalogue, Grid, Shape, World
