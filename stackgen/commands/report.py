@@ -11,12 +11,13 @@ from stackgen.commands.output import tell
 from stackgen.commands.parsing import CONFIG_FLAGS, Command, option_values
 from stackgen.commands.progress_bar import after, progress_bar
 from stackgen.errors import StackgenError
+from stackgen.evaluation.engines import completed, second_engine
 from stackgen.evaluation.parallel import simulating
 from stackgen.evaluation.protocol import Scene, evaluate, load_scenes
 from stackgen.evaluation.report.charts import draw_charts
 from stackgen.evaluation.report.references import DiversityLimit, Unseen, read_diversity_limit, read_unseen
 from stackgen.evaluation.report.results import Result, result_of, run_seconds
-from stackgen.evaluation.report.rows import LIST_NAMES, ReportSettings, check_rows, trainings
+from stackgen.evaluation.report.rows import ReportSettings, check_rows, trainings
 from stackgen.evaluation.report.sheets import draw_sheets
 from stackgen.evaluation.report.store import Store
 from stackgen.evaluation.report.tables import Conditions, Report, csv_rows, terminal_table, to_json, to_markdown
@@ -62,7 +63,8 @@ def main(
     everything, dataset = load_scenes(settings.test_set)
     scenes, manifest = everything[:limit], dataset.manifest
     physics = Physics.recorded(manifest.physics)
-    with simulating(physics, workers or cores()) as checker:
+    processes = workers or cores()
+    with simulating(physics, processes) as checker, second_engine(physics, processes) as second:
         conditions = Conditions(
             test_set=(manifest.name, manifest.sha256),
             scenes=len(scenes),
@@ -76,7 +78,7 @@ def main(
         test_set = {"name": manifest.name, "sha256": manifest.sha256}
         facts = {"code": conditions.code, "machine": conditions.machine, "dataset": test_set}
         tasks = tasks_of(settings, manifest, len(scenes), physics=conditions.physics, facts=facts)
-        answers = gather(tasks, scenes, checker, Store(cache, runs))
+        answers = gather(tasks, scenes, checker, second, Store(cache, runs))
     limits, unseen = _references(settings, conditions)
     results = [result_of(t.row, answers[t.place], t.question, limit=limits, unseen=unseen) for t in tasks]
     pictures = draw_charts(results, out)
@@ -89,28 +91,39 @@ def main(
 
 
 def gather(
-    tasks: Sequence[Task], scenes: Sequence[Scene], checker: StabilityChecker, store: Store
+    tasks: Sequence[Task],
+    scenes: Sequence[Scene],
+    checker: StabilityChecker,
+    second: StabilityChecker | None,
+    store: Store,
 ) -> dict[tuple[str, str], Evaluation]:
-    """Find the answers that are kept, run what is missing, and keep that at once."""
+    """Find the answers that are kept, complete them, run what is missing, and keep that at once."""
     answers: dict[tuple[str, str], Evaluation] = {}
+    missing = []
     for task in tasks:
         found = store.find(task.question)
-        if found:
-            answers[task.place] = found[0]
-        state = f"kept in {found[1]}" if found else "to be run"
-        tell(f"{_title(task)}: {state}")
+        tell(f"{_title(task)}: {f'kept in {found[1]}' if found else 'to be run'}")
+        if found is None:
+            missing.append(task)
+        else:
+            answers[task.place] = completed(found[0], second)
+            if answers[task.place] is not found[0]:
+                store.keep(answers[task.place], task.question)
         for path, remark in store.left_out(task.question):
             tell(f"  left out {path}: {remark}", style="yellow")
-    missing = [task for task in tasks if task.place not in answers]
-    return answers | _run(missing, scenes, checker, store)
+    return answers | _run(missing, scenes, checker, second, store)
 
 
 def _title(task: Task) -> str:
-    return f"{task.row.name}, {LIST_NAMES[task.request.block_list]} list"
+    return f"{task.row.name}, {task.row.list_name(task.request.block_list)} list"
 
 
 def _run(
-    missing: Sequence[Task], scenes: Sequence[Scene], checker: StabilityChecker, store: Store
+    missing: Sequence[Task],
+    scenes: Sequence[Scene],
+    checker: StabilityChecker,
+    second: StabilityChecker | None,
+    store: Store,
 ) -> dict[tuple[str, str], Evaluation]:
     """Run one task after the other."""
     answers: dict[tuple[str, str], Evaluation] = {}
@@ -120,7 +133,7 @@ def _run(
         for task in missing:
             before, began = len(answers) * len(scenes), time.perf_counter()
             try:
-                found = evaluate(task.request, scenes, checker, after(before, advance))
+                found = completed(evaluate(task.request, scenes, checker, after(before, advance)), second)
                 store.keep(found, task.question)
             except KeyboardInterrupt:
                 done = f"{len(answers)} of {len(missing)} are done and kept"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -53,6 +54,36 @@ def clustered_ratio(sums: ArrayLike, weights: ArrayLike, seed: int = 0) -> Estim
     low, high = np.percentile(ratios, [2.5, 97.5])
     value = s.sum() / w.sum()
     return Estimate(float(value), float(min(low, value)), float(max(high, value)))  # not apart by rounding
+
+
+def clustered_percentile(values: Sequence[Sequence[float]], percent: float, seed: int = 0) -> Estimate | None:
+    """Find the value that so many percent of all values do not exceed, with the same bootstrap over scenes.
+
+    Args:
+        values: Values of each of m scenes.
+        percent: Which percentile, above 0 and at most 100.
+        seed: Seed of the resampling.
+
+    Returns:
+        None where there are no values.
+
+    >>> clustered_percentile([[1.0, 2.0], [3.0]], 100).value
+    3.0
+    """
+    flat = np.array([value for some in values for value in some])
+    if not len(flat):
+        return None
+    order, scene = np.argsort(flat, kind="stable"), np.repeat(np.arange(len(values)), [len(some) for some in values])
+
+    def found(times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Find the percentile of each of some draws (n, m)."""
+        below = np.cumsum(times[:, scene[order]], axis=1)
+        return flat[order][(below < percent / 100 * below[:, -1:]).sum(axis=1)]
+
+    drawn = _draws(len(values), seed)
+    value = found(np.ones((1, len(values))))[0]
+    low, high = np.percentile(found(drawn[(drawn[:, np.unique(scene)] > 0).any(axis=1)]), [2.5, 97.5])
+    return Estimate(float(value), float(min(low, value)), float(max(high, value)))
 
 
 @lru_cache(maxsize=8)

@@ -19,6 +19,7 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
 from stackgen.protocols import Verdict
 from stackgen.sampling.feasible import VALID_IOU
+from stackgen.sim.statics.fit import overlaps_and_gaps
 from stackgen.stack import Layout, Stack, layout
 from stackgen.world import Grid, Mask, View
 
@@ -32,12 +33,18 @@ class SampleScore:
         ious: IoU of the settled structure with the target, for each view that has one; 0 if unstable.
         front_iou_before: IoU of the front silhouette before physics.
         layout: Shape indices of each layer from left to right, as generated; see :func:`layout`.
+        overlap: Largest overlap of two blocks, or of a block and the ground, as generated [cell]; None if not measured.
+        gap: Largest gap below a block, as generated [cell]; None if not measured.
+        in_both: Whether it stands in a second engine too; None if that was not asked.
     """
 
     stable: bool
     ious: Mapping[View, float]
     front_iou_before: float
     layout: Layout
+    overlap: float | None = None
+    gap: float | None = None
+    in_both: bool | None = None
 
     @property
     def front_iou(self) -> float:
@@ -79,7 +86,8 @@ def score_sample(stack: Stack, verdict: Verdict, targets: Mapping[View, Mask], g
     if verdict.stable:
         ious = {view: silhouette_iou(verdict.settled, target, grid, view) for view, target in targets.items()}
     before = silhouette_iou(stack, targets["front"], grid, "front")
-    return SampleScore(verdict.stable, ious, before, layout(stack, grid))
+    fit = overlaps_and_gaps(stack)
+    return SampleScore(verdict.stable, ious, before, layout(stack, grid), fit.largest_overlap, fit.largest_gap)
 
 
 # Of one scene: (sum, weight). A metric is the sum of the sums over the sum of the weights, over scenes.
@@ -147,6 +155,16 @@ def view_iou(view: View) -> SceneMetric:
 
 METRICS = ChainMap[str, SceneMetric]({"side_iou": view_iou("side"), "top_iou": view_iou("top")}, SCENE_METRICS)
 """All that is measured of a scene's samples: SCENE_METRICS, and the views that the average is made of."""
+
+
+def in_both(scene: SceneScore) -> tuple[float, float]:
+    """Share of stacks in which no block fell in either engine, of those that both were asked about."""
+    known = [s.in_both for s in scene.samples if s.in_both is not None]
+    return float(sum(known)), len(known)
+
+
+DEPTHS = ("overlap", "gap")
+"""Lengths of a sample's score [cell]; of many samples we give the 95th percentile."""
 
 
 def list_rank(ranked: ArrayLike, truth: ArrayLike) -> NDArray[np.int64]:

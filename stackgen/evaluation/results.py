@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from stackgen.errors import StackgenError
-from stackgen.evaluation.intervals import Estimate, clustered_ratio
-from stackgen.evaluation.metrics import METRICS, SampleScore, SceneScore
+from stackgen.evaluation.intervals import Estimate, clustered_percentile, clustered_ratio
+from stackgen.evaluation.metrics import DEPTHS, METRICS, SampleScore, SceneScore, in_both
 from stackgen.io.files import write_atomically, write_json
 from stackgen.io.text import read_json
 from stackgen.stack import Stack
@@ -31,6 +31,9 @@ TRUE_LIST, PREDICTED_LIST = "true", "predicted"
 
 TOP = 3
 """How many block lists a predictor is asked for; the first is built from, the rest count for top 3."""
+
+PERCENT = 95
+"""Share of the samples whose overlaps and gaps are at most as large as is said."""
 
 Question = dict[str, Any]
 """All that an evaluation depends on, as plain data; see stackgen.evaluation.requests."""
@@ -77,6 +80,7 @@ class Evaluation:
         physics: Numbers that the verdicts depend on.
         facts: What else the reader should know (weights, dataset), as JSON allows.
         checking_seconds: Wall time of checking and scoring all samples [s].
+        second: Numbers of the second engine that was asked about them; None if there was none.
     """
 
     method: str
@@ -87,11 +91,29 @@ class Evaluation:
     physics: dict[str, Any]
     facts: dict[str, Any] = field(default_factory=dict)
     checking_seconds: float | None = field(default=None, compare=False)
+    second: dict[str, Any] | None = None
 
     def estimate(self, metric: str) -> Estimate | None:
         """Give a metric of METRICS with its 95 % interval, clustered by scene."""
         parts = [METRICS[metric](scene.score) for scene in self.scenes]
         return clustered_ratio([p[0] for p in parts], [p[1] for p in parts])
+
+    def fit(self) -> dict[str, Estimate | None]:
+        """Say how blocks lie to each other.
+
+        Returns:
+            `overlap` and `gap`, which 95 % of the samples do not exceed [cell], and `in_both`, the share that stands
+            in both engines; None where that was not measured.
+        """
+        depths = {
+            name: [[d for s in scene.score.samples if (d := getattr(s, name)) is not None] for scene in self.scenes]
+            for name in DEPTHS
+        }
+        parts = [in_both(scene.score) for scene in self.scenes]
+        return {
+            **{name: clustered_percentile(values, PERCENT) for name, values in depths.items()},
+            "in_both": clustered_ratio([p[0] for p in parts], [p[1] for p in parts]),
+        }
 
     @property
     def seconds_per_sample(self) -> float | None:
@@ -130,6 +152,8 @@ class Evaluation:
             "physics": self.physics,
             "interval": "95 %, cluster bootstrap over scenes",
             "metrics": estimates_to_json(values),
+            "fit": estimates_to_json(self.fit()),
+            "second_engine": self.second,
             "block_lists": estimates_to_json(self.list_estimates()) or None,
         }
 
@@ -162,8 +186,9 @@ def write_evaluation(path: Path, evaluation: Evaluation, question: Question) -> 
 
 
 _OF_SAMPLE = ("stable", "ious", "front_iou_before", "layout")
+_OF_SAMPLE_OR_NULL = (*DEPTHS, "in_both")  # files of earlier versions lack them
 _OF_SCENE = ("name", "counts", "fell", "drop", "list_rank", "feasible", "seconds")
-_KEPT = ("method", "block_list", "num_samples", "seed", "physics", "facts", "checking_seconds")
+_KEPT = ("method", "block_list", "num_samples", "seed", "physics", "facts", "checking_seconds", "second")
 
 
 def read_evaluation(path: Path) -> tuple[Evaluation, Question]:
@@ -193,14 +218,20 @@ def read_evaluation(path: Path) -> tuple[Evaluation, Question]:
 def _scene_to_json(scene: SceneResult) -> dict[str, Any]:
     return {
         **{name: getattr(scene, name) for name in _OF_SCENE},
-        "samples": [{name: getattr(sample, name) for name in _OF_SAMPLE} for sample in scene.score.samples],
+        "samples": [
+            {name: getattr(sample, name) for name in (*_OF_SAMPLE, *_OF_SAMPLE_OR_NULL)}
+            for sample in scene.score.samples
+        ],
         "shapes": [stack.shapes.tolist() for stack in scene.stacks],
         "poses": [stack.poses.tolist() for stack in scene.stacks],
     }
 
 
 def _scene_from_json(data: Mapping[str, Any], catalogue: Catalogue) -> SceneResult:
-    samples = [{name: _tuples(sample[name]) for name in _OF_SAMPLE} for sample in data["samples"]]
+    samples = [
+        {name: _tuples(sample[name]) for name in _OF_SAMPLE} | {name: sample.get(name) for name in _OF_SAMPLE_OR_NULL}
+        for sample in data["samples"]
+    ]
     stacks = (Stack(np.array(shapes, dtype=np.int64), np.array(poses), catalogue)
               for shapes, poses in zip(data["shapes"], data["poses"], strict=True))  # fmt: skip
     score = SceneScore(tuple(SampleScore(**sample) for sample in samples))
@@ -249,6 +280,7 @@ def _sample_rows(scene: SceneResult) -> Iterator[dict[str, Any]]:
             **{f"{view}_iou": score.ious.get(view, "") for view in VIEWS},
             "avg_iou": score.average_iou,
             "front_iou_before_physics": score.front_iou_before,
+            **{f"{name}_cells": "" if (depth := getattr(score, name)) is None else depth for name in DEPTHS},
             "valid": int(score.valid),
             "fell": " ".join(map(str, fell)),
             "max_drop_cells": drop,

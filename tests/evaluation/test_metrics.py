@@ -124,6 +124,7 @@ def test_scores_follow_the_paper_unstable_is_zero_and_stable_is_the_settled_stru
     for stable in (True, False):
         verdict = Verdict(stable, np.array([not stable]), np.zeros(1), settled)
         score = score_sample(generated, verdict, targets, PAPER_GRID)  # type: ignore[arg-type]
+        assert (score.overlap, score.gap, score.in_both) == (0, 0, None)
         assert score.front_iou_before == pytest.approx(
             iou(silhouette(generated, PAPER_GRID), silhouette(target, PAPER_GRID))
         )

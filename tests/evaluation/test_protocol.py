@@ -18,7 +18,7 @@ from stackgen.data.generation.designs import draw_design, realize
 from stackgen.data.manifest import Manifest
 from stackgen.data.shards import Sample, write_shard
 from stackgen.errors import StackgenError
-from stackgen.evaluation.intervals import clustered_ratio
+from stackgen.evaluation.intervals import clustered_percentile, clustered_ratio
 from stackgen.evaluation.metrics import METRICS, SCENE_METRICS
 from stackgen.evaluation.parallel import simulating
 from stackgen.evaluation.protocol import Request, Scene, evaluate, load_scenes, scenes_of
@@ -193,6 +193,8 @@ def test_metrics_json_says_what_was_measured_and_how(some: Evaluation, tmp_path:
     }  # fmt: skip
     for estimate in found["metrics"].values():
         assert 0 <= estimate["low"] <= estimate["value"] <= estimate["high"] <= 1
+    assert found["fit"]["gap"]["value"] > 0.9  # a third of the samples is lifted by a layer
+    assert found["fit"]["in_both"] is None and found["second_engine"] is None
     write_metrics(tmp_path / "new" / "metrics.json", [some])
     with pytest.raises(StackgenError, match="cannot be written"):
         write_metrics(tmp_path / "metrics.json" / "metrics.json", [some])
@@ -244,3 +246,14 @@ def test_intervals_cover_the_truth_as_often_as_they_say_when_samples_of_a_scene_
     assert np.mean(covered) >= 0.9 > np.mean(naive)
     assert clustered_ratio([0, 0], [0, 0]) is None
     assert clustered_ratio([1, 2], [3, 3]) == clustered_ratio([1, 2], [3, 3])
+
+
+@pytest.mark.parametrize("percent", [5.0, 50.0, 95.0, 100.0])
+def test_a_percentile_is_the_least_value_that_so_many_do_not_exceed(percent: float) -> None:
+    rng = np.random.default_rng(int(percent))
+    values = [list(rng.integers(0, 9, rng.integers(0, 4)).astype(float)) for _ in range(40)]
+    flat = np.sort([value for some in values for value in some])
+    expected = next(v for v in flat if np.count_nonzero(flat <= v) >= percent / 100 * len(flat))
+    estimate = clustered_percentile(values, percent)
+    assert estimate is not None and estimate.value == expected and flat[0] <= estimate.low <= estimate.high <= flat[-1]
+    assert clustered_percentile([[], []], percent) is None

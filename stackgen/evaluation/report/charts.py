@@ -12,7 +12,6 @@ import numpy as np
 
 from stackgen.evaluation.intervals import Estimate
 from stackgen.evaluation.report.results import ALL, Result
-from stackgen.evaluation.report.rows import LIST_NAMES
 from stackgen.evaluation.results import PREDICTED_LIST, TRUE_LIST
 from stackgen.io.files import write_atomically
 from stackgen.io.text import in_a_plot
@@ -70,7 +69,7 @@ def draw_charts(results: Sequence[Result], folder: Path) -> list[str]:
         _draw_chart(chart, results, folder / chart.file)
         lines.append(f"![{chart.title}, by method and block list]({chart.file})")
     _draw_views(results, folder / VIEWS_FILE)
-    lines.append(f"![IoU of the three views with the CNN's block lists]({VIEWS_FILE})")
+    lines.append(f"![IoU of the three views with predicted block lists]({VIEWS_FILE})")
     return lines
 
 
@@ -82,7 +81,7 @@ def _draw_chart(chart: Chart, results: Sequence[Result], path: Path) -> None:
         for place, source in enumerate((TRUE_LIST, PREDICTED_LIST)):
             some = [result for result in drawn if result.block_list == source]
             x = np.array([names.index(result.row.name) for result in some]) + 0.38 * (place - 0.5)
-            _bars(panel, x, [(r, metric) for r in some], 0.36, COLOURS[source], f"{LIST_NAMES[source]} list")
+            _bars(panel, x, [(r, metric) for r in some], 0.36, COLOURS[source], f"{source} list")
             quoted = [(at, r.paper[metric]) for at, r in zip(x, some, strict=True) if metric in r.paper]
             if quoted:
                 label = "paper" if place else None
@@ -92,10 +91,10 @@ def _draw_chart(chart: Chart, results: Sequence[Result], path: Path) -> None:
 
 
 def _draw_views(results: Sequence[Result], path: Path) -> None:
-    """Draw IoU by view as the paper does, with the CNN's lists (the true stacks have no other list than theirs)."""
-    lists = {result.row.name: result for result in results}  # the last of each row: the CNN's where there is one
+    """Draw IoU by view as the paper does, with predicted lists (the true stacks have no other list than theirs)."""
+    lists = {result.row.name: result for result in results}  # the last of each row: predicted where there is one
     names = list(lists)
-    figure, (panel,) = _panels(1, len(names), "IoU by view, the CNN's block lists")
+    figure, (panel,) = _panels(1, len(names), "IoU by view, predicted block lists")
     views = (("front_iou", "front"), ("side_iou", "side"), ("top_iou", "top"), ("avg_iou", "average"))
     for place, (metric, label) in enumerate(views):
         x = np.arange(len(names)) + 0.2 * (place - 1.5)

@@ -30,6 +30,7 @@ class Result:
             of METRICS and of DiversityLimit.estimates; None where a metric does not exist.
         scenes: Number of scenes of each set.
         limit_scenes: Number of scenes of each set whose diversity limit is known.
+        fit: How the blocks of the samples lie to each other, and whether they stand in both engines, on all scenes.
         remark: What the reader must know to compare it with the others.
     """
 
@@ -39,12 +40,18 @@ class Result:
     metrics: dict[str, dict[str, Estimate | None]]
     scenes: dict[str, int]
     limit_scenes: dict[str, int]
+    fit: dict[str, Estimate | None]
     remark: str = ""
 
     @property
     def block_list(self) -> str:
         """Whose block lists: `true` or `predicted`."""
         return self.evaluation.block_list
+
+    @property
+    def list_name(self) -> str:
+        """Whose block lists, for people."""
+        return self.row.list_name(self.block_list)
 
     @property
     def paper(self) -> dict[str, float]:
@@ -69,6 +76,8 @@ class Result:
             "scenes": self.scenes,
             "limit_scenes": self.limit_scenes,
             "metrics": {subset: estimates_to_json(estimates) for subset, estimates in self.metrics.items()},
+            "fit": estimates_to_json(self.fit),
+            "second_engine": answer.second,
             "block_lists": estimates_to_json(answer.list_estimates()) or None,
         }
 
@@ -103,7 +112,8 @@ def result_of(
         own = {name: None if alone and name in DIVERSITIES else some.estimate(name) for name in METRICS}
         metrics[subset] = {**own, **compared}
     numbers = {subset: len(some.scenes) for subset, some in subsets.items()}
-    return Result(row, evaluation, question, metrics, numbers, limit_scenes, _remark(evaluation, unseen))
+    fit, remark = evaluation.fit(), _remark(evaluation, unseen)
+    return Result(row, evaluation, question, metrics, numbers, limit_scenes, fit, remark)
 
 
 def _remark(evaluation: Evaluation, unseen: Unseen | None) -> str:

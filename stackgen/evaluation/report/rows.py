@@ -11,7 +11,7 @@ from stackgen.data.dataset import TESTSET
 from stackgen.errors import StackgenError
 from stackgen.evaluation.report.references import LIMIT_FILE
 from stackgen.evaluation.requests import Method
-from stackgen.evaluation.results import PREDICTED_LIST, TRUE_LIST
+from stackgen.evaluation.results import TRUE_LIST
 from stackgen.evaluation.tables import PAPER
 
 GROUND_TRUTH = "ground-truth"
@@ -19,7 +19,8 @@ GROUND_TRUTH = "ground-truth"
 
 Kind = Literal["one-shot", "verified"]
 KINDS: tuple[Kind, ...] = ("one-shot", "verified")
-LIST_NAMES = {TRUE_LIST: "true", PREDICTED_LIST: "CNN's"}
+TRUE, NETWORKS, OWN = "true", "CNN's", "own"
+"""Whose block lists: those of the scenes, the network's, or those that the method finds itself."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +66,12 @@ class Row:
     def is_ground_truth(self) -> bool:
         """Whether nothing is sampled."""
         return self.model.weights == GROUND_TRUTH
+
+    def list_name(self, block_list: str) -> str:
+        """Name whose block lists it is asked with."""
+        if block_list == TRUE_LIST:
+            return TRUE
+        return OWN if self.model.block_list_weights == self.model.weights else NETWORKS
 
     @property
     def slug(self) -> str:

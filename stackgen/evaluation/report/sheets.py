@@ -11,7 +11,6 @@ import numpy as np
 
 from stackgen.evaluation.protocol import Scene
 from stackgen.evaluation.report.results import Result
-from stackgen.evaluation.report.rows import LIST_NAMES
 from stackgen.evaluation.results import Evaluation, SceneResult
 from stackgen.io.files import write_atomically
 from stackgen.protocols import StabilityChecker
@@ -82,7 +81,7 @@ def draw_sheets(
         name = f"sheet-{result.row.slug}.png"
         _save(_sheet(*columns), folder / name)
         shown.append(
-            f"**{result.row.name}**, {LIST_NAMES[result.block_list]} block lists; samples spread evenly over the "
+            f"**{result.row.name}**, {result.list_name} block lists; samples spread evenly over the "
             "scenes, drawn as they were sampled, with the blocks that then fell in red:"
             f"\n\n![{result.row.name}]({name})"
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -14,8 +14,8 @@ from stackgen.evaluation.intervals import Estimate
 from stackgen.evaluation.metrics import METRICS
 from stackgen.evaluation.report.references import NOTIONS, Unseen
 from stackgen.evaluation.report.results import ALL, Result, run_seconds
-from stackgen.evaluation.report.rows import KINDS, LIST_NAMES, Row, Training, trainings
-from stackgen.evaluation.results import TOP
+from stackgen.evaluation.report.rows import KINDS, NETWORKS, Row, Training, trainings
+from stackgen.evaluation.results import PERCENT, TOP
 from stackgen.evaluation.tables import HEADINGS, PAPER_COLUMNS
 
 FORMAT = "stackgen.report/2"
@@ -34,6 +34,7 @@ NAMES = {
     "iou_given_stable": "front IoU of the stable",
     "front_iou_before_physics": "front IoU as generated",
 }
+FITS = {"overlap": "largest overlap [cell]", "gap": "largest gap [cell]", "in_both": "stands in both engines [%]"}
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,12 @@ def _csv_row(result: Result, subset: str) -> dict[str, Any]:
         row[f"{name}_high"] = "" if value is None else round(100 * value.high, 4)
         if name in PAPER_COLUMNS:
             row[f"{name}_paper"] = _blank(result.paper.get(name) if subset == ALL else None)
+    for name in FITS:
+        value, scale = result.fit[name] if subset == ALL else None, 100 if name == "in_both" else 1
+        column = name if name == "in_both" else f"{name}_cells"
+        row[column] = "" if value is None else round(scale * value.value, 4)
+        row[f"{column}_low"] = "" if value is None else round(scale * value.low, 4)
+        row[f"{column}_high"] = "" if value is None else round(scale * value.high, 4)
     return row
 
 
@@ -136,9 +143,6 @@ def to_markdown(report: Report, pictures: Sequence[str]) -> str:
 def _head(conditions: Conditions) -> str:
     partly = conditions.scenes < conditions.all_scenes
     number = f"**The first {conditions.scenes} of {conditions.all_scenes}**" if partly else conditions.scenes
-    physics = conditions.physics
-    plain = {name: value if isinstance(value, str) else f"{value:.6g}" for name, value in physics.items()}
-    numbers = ", ".join(f"{name} {value}" for name, value in plain.items() if name != "engine")
     parts = [
         "# The paper's table, every row",
         f"`stackgen report` writes this page and overwrites what is changed here by hand. Code {conditions.code}.",
@@ -146,8 +150,7 @@ def _head(conditions: Conditions) -> str:
         f"{conditions.num_samples} samples each, seed {conditions.seed}. Percent; in parentheses the 95 % interval, "
         "clustered by scene ([metrics.md](../metrics.md)). The *paper's* columns quote the paper, whose numbers come "
         "from its own data and physics. **List**: whose block lists, the true ones or the most likely ones of the CNN. "
-        f"Seconds were measured on {conditions.machine}. Physics: "
-        f"{physics.get('engine', 'of unknown engine')}, {numbers}.",
+        f"Seconds were measured on {conditions.machine}. Physics: {_numbers(conditions.physics)}.",
     ]
     return "\n\n".join(parts)
 
@@ -172,6 +175,9 @@ def _section(results: Sequence[Result], unseen: Unseen | None) -> Iterator[str]:
     hidden["seconds a sample"] = lambda result, _: _seconds(result.evaluation.seconds_per_sample)
     yield _table(results, ALL, hidden)
     yield from _limit_note(results)
+    yield "### How the blocks lie to each other, as they come"
+    yield _fit_note(results)
+    yield _table(results, ALL, {heading: _fit(name) for name, heading in FITS.items()})
     for notion, meaning in NOTIONS.items() if unseen else ():
         known = [result for result in results if notion in result.metrics]
         if known and unseen:
@@ -188,7 +194,7 @@ def _table(results: Sequence[Result], subset: str, columns: dict[str, Text]) -> 
 
 def _label(result: Result) -> tuple[str, str]:
     """Name a result in the first two columns of a table."""
-    return result.row.name, LIST_NAMES[result.block_list]
+    return result.row.name, result.list_name
 
 
 def _markdown(rows: Sequence[Sequence[str]]) -> str:
@@ -210,6 +216,33 @@ def percent(estimate: Estimate | None) -> str:
     return f"{100 * estimate.value:.1f} ({100 * estimate.low:.1f} to {100 * estimate.high:.1f})"
 
 
+def _fit(name: str) -> Text:
+    return lambda result, _: percent(result.fit[name]) if name == "in_both" else _cells(result.fit[name])
+
+
+def _cells(estimate: Estimate | None) -> str:
+    return "" if estimate is None else f"{estimate.value:.3f} ({estimate.low:.3f} to {estimate.high:.3f})"
+
+
+def _fit_note(results: Sequence[Result]) -> str:
+    """Say what overlaps, gaps and the second engine are."""
+    note = (
+        f"Before anything moves. {PERCENT} % of the samples have no block that is deeper in another or in the ground, "
+        "and none that is higher above what is below it. "
+    )
+    engines = {result.evaluation.second["engine"]: result.evaluation.second for result in results
+               if result.evaluation.second}  # fmt: skip
+    if not engines:
+        return f"{note}Only one engine is installed, so no other was asked."
+    return f"{note}Stands in both: also in {' and '.join(map(_numbers, engines.values()))}, from the same poses."
+
+
+def _numbers(physics: Mapping[str, Any]) -> str:
+    """Write an engine and its numbers."""
+    plain = {name: value if isinstance(value, str) else f"{value:.6g}" for name, value in physics.items()}
+    return f"{plain.pop('engine', 'an unknown engine')} ({', '.join(f'{name} {plain[name]}' for name in plain)})"
+
+
 def _seconds(value: float | None) -> str:
     return "" if value is None else f"{value:.2g}"
 
@@ -219,14 +252,15 @@ def _limit_note(results: Sequence[Result]) -> Iterator[str]:
     known = [result for result in results if result.limit_scenes[ALL]]
     if not known:
         return
-    firsts = {result.block_list: result for result in reversed(known)}
+    firsts: dict[str, Result] = {}
+    for result in known:
+        firsts.setdefault(result.list_name, result)
     limits = [
-        f"{percent(some.metrics[ALL]['diversity_limit'])} with the {LIST_NAMES[source]} list "
-        f"({some.limit_scenes[ALL]} scenes)"
-        for source, some in sorted(firsts.items(), reverse=True)
+        f"{percent(some.metrics[ALL]['diversity_limit'])} with the {name} list ({some.limit_scenes[ALL]} scenes)"
+        for name, some in firsts.items()
     ]
     beyond = [
-        f"{result.row.name} ({LIST_NAMES[result.block_list]} list) {100 * some.value:.1f}"
+        f"{result.row.name} ({result.list_name} list) {100 * some.value:.1f}"
         for result in known
         if (some := result.metrics[ALL]["beyond_diversity_limit"]) is not None
     ]
@@ -246,10 +280,11 @@ def _block_lists(results: Sequence[Result]) -> Iterator[str]:
         predictor = str(result.question.get("predictor"))
         if estimates and predictor not in seen:
             seen.add(predictor)
-            rows.append([f"`{predictor[:12]}`", *(percent(estimate) for estimate in estimates.values())])
+            who = "CNN" if result.list_name == NETWORKS else result.row.name
+            rows.append([f"{who} `{predictor[:12]}`", *(percent(estimate) for estimate in estimates.values())])
     if rows:
-        head = ["network", "most likely list is the true one", f"true one among {TOP}", "can make the silhouette"]
-        yield "## Block lists of the CNN"
+        head = ["by", "most likely list is the true one", f"true one among {TOP}", "can make the silhouette"]
+        yield "## Predicted block lists"
         yield _markdown([head, ["---", *["--:"] * 3], *rows])
 
 
@@ -300,5 +335,5 @@ def terminal_table(results: Sequence[Result]) -> Table:
     for result in results:
         estimates = [result.metrics[ALL][name] for name in shown]
         values = ("-" if some is None else f"{100 * some.value:.1f}" for some in estimates)
-        table.add_row(escape(result.row.name), LIST_NAMES[result.block_list], *values)
+        table.add_row(escape(result.row.name), result.list_name, *values)
     return table

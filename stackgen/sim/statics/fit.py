@@ -39,6 +39,16 @@ class Fit:
     buried: Floats
     gap: Floats
 
+    @property
+    def largest_overlap(self) -> float:
+        """Largest overlap of two blocks, or of a block and the ground [cell]."""
+        return float(max(self.overlap.max(initial=0.0), self.buried.max(initial=0.0)))
+
+    @property
+    def largest_gap(self) -> float:
+        """Largest gap below a block [cell]."""
+        return float(self.gap.max(initial=0.0))
+
 
 def overlaps_and_gaps(stack: Stack) -> Fit:
     """Measure how blocks lie to each other."""
@@ -50,9 +60,12 @@ def overlaps_and_gaps(stack: Stack) -> Fit:
     lowest = np.array([vertices[:, 2].min() for vertices, *_ in bodies])
     overlap, gap = np.zeros((k, k)), np.maximum(lowest, 0.0)
     low, high = (np.array([edge(vertices, axis=0) for vertices, *_ in bodies]) for edge in (np.min, np.max))
-    for i, j in combinations(range(k), 2):
-        if (low[i, :2] >= high[j, :2]).any() or (low[j, :2] >= high[i, :2]).any():
-            continue  # neither inside nor above each other
+    beside = np.any(low[:, None, :2] >= high[None, :, :2], axis=2)  # neither inside nor above each other
+    above = low[:, None, 2] - high[None, :, 2]  # what lies further above something than it can fall needs no look
+    pairs = [pair for pair in combinations(range(k), 2) if not (beside[pair] or beside.T[pair])]
+    for i, j in sorted(pairs, key=lambda pair: max(above[pair], above.T[pair])):
+        if 0 < above[i, j] >= gap[i] or 0 < above[j, i] >= gap[j]:
+            continue
         depth, fall, rise = _between(bodies[i], bodies[j])
         overlap[i, j] = overlap[j, i] = depth
         gap[i], gap[j] = min(gap[i], fall), min(gap[j], rise)

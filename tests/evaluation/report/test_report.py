@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from stackgen.errors import StackgenError
+from stackgen.evaluation.engines import completed, second_engine
 from stackgen.evaluation.intervals import Estimate
 from stackgen.evaluation.metrics import METRICS, SampleScore, SceneScore
 from stackgen.evaluation.report.charts import draw_charts
@@ -42,6 +44,8 @@ from stackgen.evaluation.results import (
     write_evaluation,
 )
 from stackgen.evaluation.tables import PAPER_COLUMNS
+from stackgen.protocols import StabilityChecker, Verdict
+from stackgen.sim.physics import Physics
 from stackgen.stack import Layout, Stack
 
 ONE: Layout = ((0, 0), (1,), (), ())
@@ -58,7 +62,7 @@ def question(**changes: Any) -> dict[str, Any]:
 
 def sample(stable: bool = True, iou: float = 0.9, shape: Layout = ONE) -> SampleScore:
     seen = iou if stable else 0.0
-    return SampleScore(stable, {"front": seen, "side": seen / 2, "top": seen / 4}, iou, shape)
+    return SampleScore(stable, {"front": seen, "side": seen / 2, "top": seen / 4}, iou, shape, 0.25, 0.0, stable)
 
 
 def scene(name: str, *samples: SampleScore) -> SceneResult:
@@ -92,7 +96,7 @@ def test_an_evaluation_is_read_as_it_was_written(answered: Evaluation, tmp_path:
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"format": "stackgen.evaluation/2"}', '{"format": "else"}'])
 def test_a_damaged_evaluation_is_one_line(text: str, tmp_path: Path) -> None:
     (tmp_path / "e.json").write_text(text)
-    with pytest.raises(StackgenError, match=r"e\.json is damaged"):
+    with pytest.raises(StackgenError, match=r"e\.json is (damaged|not JSON)"):
         read_evaluation(tmp_path / "e.json")
 
 
@@ -125,11 +129,59 @@ def test_half_of_an_answer_is_none_and_said_to_be(answered: Evaluation, tmp_path
     (file,) = tmp_path.glob("*.json")
     whole = file.read_text()
     file.write_text(whole[:500])
-    with pytest.warns(UserWarning, match="damaged"):
+    with pytest.warns(UserWarning, match="not JSON"):
         assert store.find(question()) is None
     file.write_text(whole.replace("stackgen.evaluation/2", "stackgen.evaluation/1"))
     with pytest.warns(UserWarning, match="older version"):
         assert store.find(question()) is None
+
+
+def test_an_answer_of_an_earlier_version_is_completed(answered: Evaluation, tmp_path: Path) -> None:
+    store = Store(tmp_path, tmp_path)
+    store.keep(answered, question())
+    (file,) = tmp_path.glob("*.json")
+    content = json.loads(file.read_text())
+    content["rows"][0]["kept"].pop("second")
+    for scene in content["rows"][0]["results"]:
+        for some in scene["samples"]:
+            for name in ("overlap", "gap", "in_both"):
+                some.pop(name)
+    file.write_text(json.dumps(content))
+    found = store.find(question())
+    assert found is not None and set(found[0].fit().values()) == {None}
+    second = Leaning()
+    whole = completed(found[0], second)
+    assert second.asked == 5  # of six samples one falls
+    fit = {name: value(estimate) for name, estimate in whole.fit().items()}
+    assert fit == pytest.approx({"overlap": 1 / 6, "gap": 0.0, "in_both": 5 / 6}, abs=0.06)
+    assert completed(whole, second) is whole and second.asked == 5
+    assert completed(whole, None) is whole
+
+
+class Leaning(StabilityChecker):
+    """By which everything stands."""
+
+    physics = Physics(engine="mujoco")
+    asked = 0
+
+    def check(self, stack: Stack) -> Verdict:
+        self.asked += 1
+        return Verdict(True, np.zeros(len(stack), bool), np.zeros(len(stack)), stack)
+
+
+def test_a_second_engine_is_the_other_one() -> None:
+    with second_engine(Physics(engine="bullet", friction=0.4)) as second:
+        if find_spec("mujoco"):
+            assert second is not None and second.physics == Physics(engine="mujoco", friction=0.4)
+        else:
+            assert second is None
+
+
+def test_a_list_is_the_method_s_own_where_it_predicts_itself() -> None:
+    own = replace(ROW, model=Method("search", "search"))
+    assert [own.list_name(PREDICTED_LIST), ROW.list_name(PREDICTED_LIST), own.list_name(TRUE_LIST)] == [
+        "own", "CNN's", "true",
+    ]  # fmt: skip
 
 
 def test_tests_under_other_conditions_are_left_out_and_named(answered: Evaluation, tmp_path: Path) -> None:
@@ -266,6 +318,8 @@ def test_tables_hold_every_row_in_the_section_of_its_kind(answered: Evaluation, 
     assert [row["method"] for row in rows] == ["A method", "Verified one"]
     assert float(rows[0]["stability"]) == pytest.approx(83.3333) and rows[0]["stability_paper"] == "85.2"
     assert rows[1]["stability_paper"] == "" and rows[1]["number_of_scenes"] == "2"
+    assert "| A method | CNN's | 0.250 (0.250 to 0.250) | 0.000 (0.000 to 0.000) | 83.3 (66.7 to 100.0) |" in one_shot
+    assert (rows[0]["overlap_cells"], rows[0]["in_both"]) == ("0.25", "83.3333")
     first = json.loads(json.dumps(to_json(report), allow_nan=False))["rows"][0]
     assert first["remark"] == "on other data" and set(first["paper_percent"]) == set(PAPER_COLUMNS)
     assert first["metrics"]["all"]["stability"]["value"] == pytest.approx(5 / 6)
