@@ -1,29 +1,33 @@
 """How every method degrades on silhouettes that the generator cannot have made.
 
-Scenes of testset-v1, evenly spread, each disturbed in several ways and asked for as `stackgen sample` asks: with the
-CNN's block list, the silhouette shifted to the grid's cells. Front IoU is with the disturbed silhouette. Intervals are
-95 %, clustered by scene. Each row is printed and written when it is there.
+Scenes of testset-v1, evenly spread, each disturbed in several ways and asked for as `stackgen sample --one_shot` asks:
+with the CNN's block list, the silhouette shifted to the grid's cells. `search` chooses blocks itself and shifts
+nothing; `together` is what `stackgen sample` delivers. Front IoU is with the disturbed silhouette. Intervals are 95 %,
+clustered by scene. Each row is printed and written when it is there.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import ndimage
 
-from benchmarks.common import argument_parser, plain_table, report, start
+from benchmarks.common import argument_parser, machine, plain_table, report, start
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette
 from stackgen.io.files import write_json
 from stackgen.protocols import StabilityChecker, StackSampler
 from stackgen.sampling.alignment import AlignedSampler
+from stackgen.search.sampler import NAME, side_by_side
 from stackgen.stack import Stack
 from stackgen.vision.drawings import grid_offset
-from stackgen.world import PAPER_GRID, Mask, World
+from stackgen.world import PAPER_GRID, PAPER_WORLD, Mask, World
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,6 +36,7 @@ if TYPE_CHECKING:
     from stackgen.protocols import BlockListPredictor
 
 METRICS = ("stability", "front_iou", "iou_given_stable")
+TOGETHER = "together"
 DRAWINGS = Path("examples/silhouettes")
 
 Disturb = Callable[[Mask, np.random.Generator], Mask]
@@ -45,13 +50,18 @@ def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
     names = ["brute-force", "greedy-random", "default"]
-    options.add_argument("--weights", nargs="+", default=names, help="methods: names, files of weights or run folders")
+    options.add_argument(
+        "--weights", nargs="+", default=names, help="methods: names (`together` too), files of weights, run folders"
+    )
     options.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS), help="kinds of silhouettes")
     options.add_argument("--scenes", type=int, default=50, help="scenes, evenly spread over the test set")
     options.add_argument("--num_samples", type=int, default=3, help="samples of each scene")
     options.add_argument("--verified", action="store_true", help="add verified sampling with the last of the weights")
     options.add_argument("--draws", type=int, default=64, help="stacks that verified sampling may draw for a scene")
     options.add_argument("--seed", type=int, default=0, help="seed of disturbances and noise")
+    options.add_argument(
+        "--add_to", type=Path, metavar="FILE.json", help="earlier result, the rest of whose rows is kept"
+    )
     return options
 
 
@@ -211,6 +221,53 @@ class AlignedPredictor:
         return self.predictor.predict(np.stack(shifted), top, limit)
 
 
+@dataclass(frozen=True)
+class WithOwnLists:
+    """A StackSampler that chooses the blocks itself; where it finds nothing, those that were given lie on the ground.
+
+    Args:
+        ask: Gives the best stacks for a silhouette (H, W), at most so many, by seed.
+    """
+
+    ask: Callable[[Mask, int, int], Sequence[Stack]]
+    world: World = PAPER_WORLD
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    card: Mapping[str, Any] = field(default_factory=dict)
+
+    def sample_batch(
+        self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
+    ) -> list[list[Stack]]:
+        """See StackSampler; the best stack again where there are too few."""
+        scenes = []
+        for mask, block_list in zip(silhouettes, counts, strict=True):
+            try:
+                stacks = list(self.ask(mask, num_samples, seed))
+            except StackgenError:
+                stacks = []
+            stacks = stacks or [side_by_side(block_list, self.world)]
+            scenes.append([stacks[i % len(stacks)] for i in range(num_samples)])
+        return scenes
+
+
+def searched(silhouette: Mask, number: int, seed: int) -> list[Stack]:
+    """What the search finds; the seed changes nothing."""
+    from stackgen.search.solver import solve
+
+    return [answer.stack for answer in solve(silhouette, PAPER_WORLD, number)]
+
+
+def together(silhouette: Mask, number: int, seed: int) -> Sequence[Stack]:
+    """What `stackgen sample` delivers."""
+    from stackgen.api import best
+    from stackgen.vision.reader import Reading
+
+    overlay = np.zeros((*silhouette.shape, 3), np.uint8)
+    return best(Reading(silhouette, "drawing", 1.0, overlay, exact=silhouette), number, seed).stacks
+
+
+OWN_LISTS = {NAME: WithOwnLists(searched), TOGETHER: WithOwnLists(together)}
+
+
 def methods_of(options: argparse.Namespace, checker: StabilityChecker) -> dict[str, StackSampler]:
     """The methods to ask, by name."""
     from stackgen.sampling.methods import load_sampler
@@ -218,6 +275,9 @@ def methods_of(options: argparse.Namespace, checker: StabilityChecker) -> dict[s
 
     methods: dict[str, StackSampler] = {}
     for name in options.weights:
+        if name in OWN_LISTS:
+            methods[title := name] = OWN_LISTS[name]
+            continue
         sampler = load_sampler(name)
         title = str(sampler.card.get("name", name))
         methods[title] = AlignedSampler(sampler)
@@ -241,14 +301,14 @@ def main() -> None:
     scenes = [everything[i] for i in np.linspace(0, len(everything) - 1, number).round().astype(int)]
     checker, predictor = SimulatorChecker(until_fall=True), AlignedPredictor(load_predictor("default"))
     methods = methods_of(options, checker)
-    rows: list[dict[str, Any]] = []
-    metrics = {
+    metrics: dict[str, Any] = {
         "test_set": dataset.manifest.sha256,
         "samples_per_scene": options.num_samples,
         "seed": options.seed,
         "physics": checker.physics.to_json(),
-        "rows": rows,
     }
+    metrics["rows"] = rows = kept(options.add_to, options.kinds, methods, metrics) if options.add_to else []
+    facts = {"commit": machine()["commit"]}
     for kind in options.kinds:
         asked = scenes_of_kind(kind, scenes, checker, options.seed)
         for name, sampler in methods.items():
@@ -257,13 +317,35 @@ def main() -> None:
             )
             found = evaluate(request, asked, checker)
             estimates = {metric: found.estimate(metric) for metric in METRICS}
-            rows.append({"silhouettes": kind, "scenes": len(asked), "method": name}
-                        | {metric: value and value.to_json() for metric, value in estimates.items()})  # fmt: skip
-            print(f"{kind}, {name}: " + ", ".join(f"{m} {_percent(rows[-1][m])}" for m in METRICS), flush=True)
+            row = {"silhouettes": kind, "scenes": len(asked), "method": name, **facts}
+            row |= {metric: value and value.to_json() for metric, value in estimates.items()}
+            row["seconds_per_sample"] = found.seconds_per_sample
+            print(f"{kind}, {name}: " + ", ".join(f"{m} {_percent(row[m])}" for m in METRICS), flush=True)
+            rows.append(row)
+            rows.sort(key=lambda row: KINDS.index(row["silhouettes"]))  # stable: methods stay in order
             if options.out is not None:
                 options.out.parent.mkdir(parents=True, exist_ok=True)
                 write_json(options.out, metrics)
     report("out_of_distribution", metrics, [table(rows, metric) for metric in METRICS[:2]], options.out)
+
+
+def kept(
+    path: Path, kinds: Sequence[str], methods: Mapping[str, StackSampler], conditions: Mapping[str, Any]
+) -> list[dict[str, Any]]:
+    """The rows of an earlier result that are not measured again, each with the commit it was measured at.
+
+    Raises:
+        StackgenError: If it was measured under other conditions.
+    """
+    content = json.loads(path.read_text())
+    found = content["figures"]
+    if any(found[name] != value for name, value in conditions.items()):
+        raise StackgenError(f"{path} holds another test set, seed, number of samples or physics")
+    return [
+        {"commit": content["machine"]["commit"], **row}
+        for row in found["rows"]
+        if row["silhouettes"] not in kinds or row["method"] not in methods
+    ]
 
 
 def table(rows: Sequence[Mapping[str, Any]], metric: str) -> Any:
