@@ -13,7 +13,7 @@ from rich.table import Table
 from stackgen.api import check
 from stackgen.commands.output import tell, wrote
 from stackgen.commands.parsing import Command, Files
-from stackgen.commands.verdict_table import FALLS, STANDS, verdict_facts, verdict_table
+from stackgen.commands.verdict_table import FALLS, STANDS, verdict_facts, verdict_table, verdict_word
 from stackgen.io.stacks_file import StackEntry, read_stacks, write_stacks
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.sim.physics import Physics
@@ -28,7 +28,7 @@ def main(
 ) -> int:
     """Simulate the structures of a stacks file and say which stand.
 
-    The exit code is 1 if any falls, or has blocks inside each other or in the ground.
+    The exit code is 1 if any falls, or has blocks inside each other, in the ground or in the air.
 
     Args:
         file: File of stacks (stacks.json), made by stackgen or written by hand; `-` is standard input.
@@ -45,20 +45,19 @@ def main(
         replace(check(checker, entry.stack, content.target, content.world.grid), comment=entry.comment)
         for entry in content.entries
     )
-    tell(verdict_table("file", [(file.name, entries)]))
+    words = [verdict_word(entry, those) for entry, those in zip(entries, misfits, strict=True)]
+    tell(verdict_table("file", [(file.name, entries)], words=words))
     if explain:
         entries, statics = _explained(entries, physics)
         tell("", statics)
     for number, those in enumerate(misfits, 1):
         tell(*(f"stack {number}: {misfit.text}" for misfit in those))
-    told = zip(entries, misfits, strict=True)
-    facts = [{**verdict_facts(entry), "misfits": [misfit.text for misfit in those]} for entry, those in told]
+    facts = [verdict_facts(entry, those) for entry, those in zip(entries, misfits, strict=True)]
     tell(physics=physics.to_json(), stacks=facts)
     if out is not None:
         write_stacks(out, replace(content, entries=entries, physics=physics.to_json()))
         wrote(out)
-    impossible = any(misfit.impossible for those in misfits for misfit in those)
-    return 0 if not impossible and all(entry.verdict and entry.verdict.stable for entry in entries) else 1
+    return int(any(word != STANDS for word in words))
 
 
 def _explained(entries: Sequence[StackEntry], physics: Physics) -> tuple[tuple[StackEntry, ...], Table]:

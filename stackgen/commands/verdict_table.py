@@ -11,12 +11,18 @@ from rich.table import Table
 
 from stackgen.io.stacks_file import StackEntry
 from stackgen.protocols import Verdict
+from stackgen.sim.statics.fit import Misfit
 from stackgen.stack import Stack
 
 STANDS, FALLS = "[green]stands[/]", "[red]falls[/]"
 
 
-def verdict_table(heading: str, sources: Iterable[tuple[str, Sequence[StackEntry]]], most: int | None = None) -> Table:
+def verdict_table(
+    heading: str,
+    sources: Iterable[tuple[str, Sequence[StackEntry]]],
+    most: int | None = None,
+    words: Sequence[str] | None = None,
+) -> Table:
     """Make a table with one row for each stack.
 
     Stacks are numbered from 1 and blocks from 0, as in the file and the picture.
@@ -25,17 +31,17 @@ def verdict_table(heading: str, sources: Iterable[tuple[str, Sequence[StackEntry
         heading: Heading of the column that says where a stack came from.
         sources: Where stacks came from, and those stacks with their verdicts.
         most: Largest number of fallen blocks to name for each stack; all by default.
+        words: What is said of each stack of a source; that it stands or falls by default.
     """
     table = Table(heading, "stack", "verdict", "front IoU", "matches", "what fell", box=None, pad_edge=False)
     for column in (table.columns[1], table.columns[3]):
         column.justify = "right"
     for source, entries in sources:
         for number, entry in enumerate(entries, 1):
-            stands = entry.verdict is not None and entry.verdict.stable
             table.add_row(
                 escape(source) if number == 1 else "",
                 str(number),
-                STANDS if stands else FALLS,
+                words[number - 1] if words else verdict_word(entry),
                 "" if entry.front_iou is None else f"{entry.front_iou:.2f}",
                 "" if entry.matches is None else "yes" if entry.matches else "no",
                 escape(describe_fall(entry.stack, entry.verdict, most)) if entry.verdict else "",
@@ -43,17 +49,25 @@ def verdict_table(heading: str, sources: Iterable[tuple[str, Sequence[StackEntry
     return table
 
 
-def verdict_facts(entry: StackEntry) -> dict[str, Any]:
-    """Give what programs are told of a stack: verdict, drops [cell], margin [rad] where it is known, and fit."""
+def verdict_word(entry: StackEntry, misfits: Sequence[Misfit] = ()) -> str:
+    """Say in a word, in its colour, what becomes of a stack; of one that no blocks can form, why that is."""
+    if entry.verdict is None or not entry.verdict.stable:
+        return FALLS
+    return next((f"[red]{misfit.kind}[/]" for misfit in misfits if misfit.impossible), STANDS)
+
+
+def verdict_facts(entry: StackEntry, misfits: Sequence[Misfit] = ()) -> dict[str, Any]:
+    """Give what programs are told of a stack: verdict, drops [cell], margin [rad] where it is known, and misfits."""
     verdict = entry.verdict
     known = verdict and {
-        "stands": verdict.stable,
+        "stands": verdict_word(entry, misfits) == STANDS,
         "at_rest": verdict.at_rest,
         "fell": np.flatnonzero(verdict.fell),
         "drop": verdict.drop,
         "margin": verdict.margin,
     }
-    return {"verdict": known, "front_iou": entry.front_iou, "matches": entry.matches}
+    texts = [misfit.text for misfit in misfits]
+    return {"verdict": known, "front_iou": entry.front_iou, "matches": entry.matches, "misfits": texts}
 
 
 def describe_fall(stack: Stack, verdict: Verdict, most: int | None = None) -> str:

@@ -27,29 +27,33 @@ def test_check_explains(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.parametrize(
-    ("blocks", "words"),
+    ("blocks", "word", "reason"),
     [
-        ([("cube", 0, 0.5), ("cube", 0, 0.5)], "block 0 (cube) and block 1 (cube) are 1.00 cells inside each other"),
-        ([("cube", 0, -3)], "block 0 (cube) is 3.50 cells in the ground"),
-        ([("cube", 0, 0.5), ("cube", 0, 1.2)], "block 0 (cube) and block 1 (cube) are 0.30 cells inside each other"),
+        ([("cube", 0, 0.5), ("cube", 0, 0.5)], "overlaps", "block 0 (cube) and block 1 (cube) are 1.00 cells inside"),
+        ([("cube", 0, 0.5), ("cube", 0, 1.2)], "overlaps", "block 0 (cube) and block 1 (cube) are 0.30 cells inside"),
+        ([("cube", 0, -3)], "buried", "block 0 (cube) is 3.50 cells in the ground"),
+        ([("cube", 0, 0.8)], "floats", "block 0 (cube) floats 0.30 cells above what is below it"),
     ],
 )
 def test_what_cannot_be_is_said_and_does_not_pass(
-    blocks: list[tuple[str, float, float]], words: str, cli: Cli, tmp_path: Path
+    blocks: list[tuple[str, float, float]], word: str, reason: str, cli: Cli, tmp_path: Path
 ) -> None:
     file = tmp_path / "stacks.json"
     file.write_text(json.dumps(stacks_json([("cube", 0, 0.5)], blocks)))
     answer = cli("check", file)
-    assert answer.code == 1 and f"stack 2: {words}" in answer.out and "stack 1:" not in answer.out
-    facts = json.loads(cli("check", file, "--json").out)
-    assert [entry["misfits"] for entry in facts["stacks"]] == [[], [words]]
+    rows = [line.split() for line in answer.out.splitlines()]
+    assert rows[1][1:3] == ["1", "stands"] and rows[2][:2] == ["2", word]
+    assert answer.code == 1 and f"stack 2: {reason}" in answer.out and "stack 1:" not in answer.out
+    first, second = json.loads(cli("check", file, "--json").out)["stacks"]
+    assert first["verdict"]["stands"] and first["misfits"] == []
+    assert not second["verdict"]["stands"] and second["misfits"][0].startswith(reason)
 
 
-def test_a_block_in_the_air_is_said(cli: Cli, tmp_path: Path) -> None:
+def test_a_small_gap_is_said_alone(cli: Cli, tmp_path: Path) -> None:
     file = tmp_path / "stacks.json"
-    file.write_text(json.dumps(stacks_json([("cube", 0, 0.8)])))
+    file.write_text(json.dumps(stacks_json([("cube", 0, 0.7)])))
     answer = cli("check", file)
-    assert answer.code == 0 and "block 0 (cube) floats 0.30 cells above what is below it" in answer.out
+    assert answer.code == 0 and "block 0 (cube) floats 0.20 cells above what is below it" in answer.out
 
 
 @pytest.mark.parametrize("size", [0.0005, 0.02, 10.0])

@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +74,7 @@ def overlaps_and_gaps(stack: Stack) -> Fit:
 
 
 WORTH_SAYING, IMPOSSIBLE = 0.1, 0.25
-"""From where on a misfit is named, and from where on no such structure can be built: samples lie up to 0.2 inside each
+"""From where on a misfit is named, and from where on no such structure can be: samples lie up to 0.2 inside each
 other, and are pushed apart by the simulator [cell]."""
 
 
@@ -82,12 +83,19 @@ class Misfit:
     """Something that no structure of real blocks has.
 
     Args:
+        kind: What is wrong, in a word.
+        depth: How far it is from what can be [cell].
         text: Description that names the blocks.
-        impossible: Whether the blocks would have to be in one place.
     """
 
+    kind: Literal["overlaps", "buried", "floats"]
+    depth: float
     text: str
-    impossible: bool
+
+    @property
+    def impossible(self) -> bool:
+        """Whether no structure can be like this, not even nearly."""
+        return self.depth > IMPOSSIBLE
 
 
 def describe_misfits(stack: Stack) -> list[Misfit]:
@@ -95,13 +103,14 @@ def describe_misfits(stack: Stack) -> list[Misfit]:
     fit, names = overlaps_and_gaps(stack), [f"block {i} ({name})" for i, name in enumerate(stack.names)]
     found = []
     for i, j in np.argwhere(np.triu(fit.overlap) > WORTH_SAYING).tolist():
-        depth = fit.overlap[i, j]
-        found.append(Misfit(f"{names[i]} and {names[j]} are {depth:.2f} cells inside each other", depth > IMPOSSIBLE))
+        depth = float(fit.overlap[i, j])
+        found.append(Misfit("overlaps", depth, f"{names[i]} and {names[j]} are {depth:.2f} cells inside each other"))
     for i in np.flatnonzero(fit.buried > WORTH_SAYING).tolist():
-        depth = fit.buried[i]
-        found.append(Misfit(f"{names[i]} is {depth:.2f} cells in the ground", bool(depth > IMPOSSIBLE)))
+        depth = float(fit.buried[i])
+        found.append(Misfit("buried", depth, f"{names[i]} is {depth:.2f} cells in the ground"))
     for i in np.flatnonzero(fit.gap > WORTH_SAYING).tolist():
-        found.append(Misfit(f"{names[i]} floats {fit.gap[i]:.2f} cells above what is below it", False))
+        depth = float(fit.gap[i])
+        found.append(Misfit("floats", depth, f"{names[i]} floats {depth:.2f} cells above what is below it"))
     return found
 
 

@@ -79,5 +79,9 @@ def test_misfits_name_blocks_and_say_which_no_structure_can_have() -> None:
         "block 2 (cube) is 0.40 cells in the ground",
         "block 3 (cube) floats 1.50 cells above what is below it",
     ]
-    assert [misfit.impossible for misfit in found] == [False, True, False]
+    assert [(misfit.kind, misfit.impossible) for misfit in found] == [
+        ("overlaps", False),
+        ("buried", True),
+        ("floats", True),
+    ]
     assert not describe_misfits(stack_of((CUBE, 0, 0.5, 0), (CUBE, 0.05, 1.47, 0)))
