@@ -6,6 +6,7 @@ settled.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -41,12 +42,14 @@ class Best:
         target: (H, W) silhouette.
         chosen: Candidates, the best first.
         asked: Number of stacks that the search and the sampler proposed.
+        late: Whether the time of the search was up before it had looked at all.
     """
 
     world: World
     target: Mask
     chosen: tuple[Candidate, ...]
     asked: tuple[int, int]
+    late: bool = False
 
 
 def best_stacks(
@@ -79,7 +82,9 @@ def best_stacks(
     Raises:
         StackgenError: If nothing was found that could be simulated.
     """
+    began = time.perf_counter()
     at = _search(reading, world, cells, number, block_list, inventory, settings)
+    late = settings.seconds is not None and time.perf_counter() - began > settings.seconds
     searched = [answer.stack for answer in at.answers]
     found = _judged(searched, at, checker)
     more: list[Candidate] = []
@@ -91,8 +96,9 @@ def best_stacks(
         more = _judged(standing, at, checker)
     chosen = best([*found, *more], number)
     if not chosen:
-        raise StackgenError("nothing that stands was found; give more cells, other blocks, or leave the block list out")
-    return Best(at.world, at.target, chosen, (len(searched), len(more)))
+        way = "a larger budget" if late else "more cells, other blocks, or leave the block list out"
+        raise StackgenError(f"nothing that stands was found; give {way}")
+    return Best(at.world, at.target, chosen, (len(searched), len(more)), late)
 
 
 def _search(

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import re
+import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -20,8 +21,9 @@ from numpy.typing import NDArray
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
 from stackgen.search.problem import SearchSettings
+from stackgen.search.rows import BLOCK, Levels, pack
 from stackgen.search.solver import Answer, solve
-from stackgen.vision.reader import place
+from stackgen.vision.masks import place
 from stackgen.world import Grid, Mask, World
 
 MOST_CELLS = 8
@@ -33,6 +35,10 @@ MOST_BLOCKS = 40
 WORTH = 0.004
 """IoU by which each block must improve the fit."""
 
+SLACK = 0.02
+"""How much less than the best so far a scale may promise and be tried all the same."""
+
+_LEAST = 1e-3  # time that a search is given when all of it is spent [s]
 _FINE = 112  # height of the pictures in which scales are compared [pixel]
 
 
@@ -131,24 +137,48 @@ def best_scale(
     if cells.wide is not None and cells.high is not None:  # stretched to its cells
         size = (len(figure) * cells.wide // cells.high or 1, len(figure))
         figure = cv2.resize(figure.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-    best: Scaled | None = None
-    most = -math.inf
+    began = time.perf_counter()
+
+    def answers(at: Scaled, wanted: int) -> tuple[Answer, ...]:
+        left = settings
+        if settings.seconds is not None:
+            left = replace(settings, seconds=max(settings.seconds - (time.perf_counter() - began), _LEAST))
+        return tuple(solve(at.target, at.world, wanted, block_list, inventory, left))
+
+    tried: list[tuple[float, Scaled]] = []
+    for promise, at in _by_promise(figure, world, [cells.high] if cells.high else _heights(figure, world)):
+        late = settings.seconds is not None and time.perf_counter() - began > settings.seconds
+        if tried and (late or promise < max(worth for worth, _ in tried) - SLACK):
+            break
+        best = answers(at, 1)
+        worth = max((fine_iou(a, figure, at) - WORTH * len(a.stack) for a in best), default=-1.0)
+        tried.append((worth, replace(at, answers=best)))
+    chosen = max(tried, key=lambda one: one[0])[1]
+    return replace(chosen, answers=answers(chosen, number) or chosen.answers) if number > 1 else chosen
+
+
+def _by_promise(figure: Mask, world: World, heights: Sequence[float]) -> list[tuple[float, Scaled]]:
+    """Put a figure into the world at each height; sort by the IoU of the best rows, stand or fall, less their blocks.
+
+    Raises:
+        StackgenError: If the figure is too thin to be seen at any of them.
+    """
+    promises = []
     refused: StackgenError | None = None
-    for high in [cells.high] if cells.high else _heights(figure, world):
+    for high in heights:
         try:
-            tried = scaled(figure, world, high)
+            at = scaled(figure, world, high)
         except StackgenError as error:
             refused = error
             continue
-        answers = solve(tried.target, tried.world, number, block_list, inventory, settings)
-        worth = max((fine_iou(a, figure, tried) - WORTH * len(a.stack) for a in answers), default=-1.0)
-        if worth > most:
-            best, most = replace(tried, answers=tuple(answers)), worth
-        if most > 1 - WORTH * (high + 1) - 0.01:  # no scale of more rows can be better
-            break
-    if best is None:
+        levels = Levels(at.target, at.world)
+        rows = [found[0] for found in pack(levels.gains, levels.widths, keep=1, depth=MOST_CELLS)]
+        blocks = sum(len(row.blocks) for row in rows)
+        fit = (sum(row.gain for row in rows) + BLOCK * blocks) / float(at.target.sum())
+        promises.append((fit - WORTH * blocks, at))
+    if not promises:
         raise refused or StackgenError("the drawing is wider than eight times its height; draw it higher")
-    return best
+    return sorted(promises, key=lambda one: -one[0])
 
 
 def _heights(figure: Mask, world: World) -> Sequence[float]:

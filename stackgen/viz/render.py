@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from stackgen.errors import StackgenError
 from stackgen.geometry import block_vertices
 from stackgen.io.files import write_atomically
+from stackgen.io.stacks_file import MATCHES
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
 from stackgen.viz.raster import Camera, borders, fill_nearest
@@ -282,7 +283,8 @@ def _caption(number: int, stack: Stack, verdict: Verdict | None, score: float | 
     if verdict is None:
         return [(f"{number}", _LINE), (match, _MUTED)]
     if verdict.stable:
-        return [(f"{number}: stands", _GOOD), (match, _MUTED)]
+        told = "" if score is None else ", matches" if score >= MATCHES else ", does not match"
+        return [(f"{number}: stands", _GOOD), (match + told, _MUTED)]
     fallen = np.flatnonzero(verdict.fell)
     worst = int(fallen[np.argmax(verdict.drop[fallen])]) if len(fallen) else 0
     which = f"block {worst} ({stack.names[worst].replace('_', ' ')}) fell {verdict.drop[worst]:.1f} cells"

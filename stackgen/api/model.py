@@ -1,11 +1,11 @@
-"""The library's front door: `stackgen.load(...)`, `model.sample(...)`. The command line uses it too."""
+"""One method, asked by name: `stackgen.load(...)`, `model.sample(...)`. The command line uses it too."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,12 +19,9 @@ from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.names import DEFAULT, CheckerName
 from stackgen.protocols import BlockListPredictor, StabilityChecker, StackSampler
 from stackgen.sampling.alignment import AlignedSampler
-from stackgen.search.problem import SearchSettings
-from stackgen.search.sampler import SearchSampler
-from stackgen.search.scale import MOST_BLOCKS, Cells
 from stackgen.stack import Stack, check_block_list, parse_block_list
 from stackgen.vision.drawings import grid_offset
-from stackgen.vision.reader import Reading, read_picture, read_silhouette
+from stackgen.vision.reader import read_silhouette
 from stackgen.world import Grid, Mask, World
 
 if TYPE_CHECKING:
@@ -369,83 +366,6 @@ def _configured(loaded: StackSampler, weights: str, settings: SamplerConfig) -> 
     if not hasattr(loaded, "configured"):
         raise StackgenError(f"{weights} is no diffusion model: leave the settings of the sampler out")
     return loaded.configured(settings)
-
-
-def best(
-    silhouette: Silhouette | Reading,
-    num_samples: int = 3,
-    seed: int = 0,
-    blocks: BlockList | None = None,
-    inventory: Inventory | None = None,
-    cells: str = "auto",
-    search: SearchSettings = SearchSettings(),  # noqa: B008 - frozen
-    on_step: Callable[[], None] = lambda: None,
-) -> StacksFile:
-    """Find the best stacks for a picture at any scale, by search and network together, simulated.
-
-    Args:
-        silhouette: Picture of a structure: a drawing, the photo of a sketch, a depth frame; or what was read in one.
-        num_samples: Largest number of stacks; they have different layouts, as far as such stacks stand and match.
-        seed: Seed of what the network proposes.
-        blocks: Block list, all of which is used; by default the search chooses one for each stack.
-        inventory: Blocks that are available, in the same forms.
-        cells: Height of the structure in cells, such as `6`, or width and height, such as `6x5`; `auto` finds it.
-        search: How long and for what the search looks.
-        on_step: Called twice: once the picture is read, and once stacks were found.
-
-    Returns:
-        What `stacks.json` holds, in a world whose grid is as large as the structure.
-
-    Raises:
-        StackgenError: If nothing is seen in the picture, or no stack is found.
-    """
-    from stackgen.sampling.best import best_stacks
-    from stackgen.sim.checkers import SimulatorChecker
-
-    @cache
-    def network() -> Model:
-        return load()
-
-    def proposals(target: Mask, block_list: NDArray[np.int64] | None) -> list[Stack]:
-        given = inventory if block_list is None else None
-        return network().sample_verified(target, num_samples, seed, block_list, given).stacks
-
-    asked = Model(SearchSampler(), checker=SimulatorChecker())
-    Model._check_draw(num_samples, seed)
-    if blocks is not None and inventory is not None:
-        raise StackgenError("give a block list or an inventory to choose it from, not both")
-    world = asked.world if blocks is None else replace(asked.world, max_blocks=MOST_BLOCKS)
-    listed = None if blocks is None else Model(SearchSampler(world)).counts(blocks)
-    there = None if inventory is None else asked.inventory(inventory)
-    reading = silhouette if isinstance(silhouette, Reading) else read_picture(silhouette, asked.world.grid)
-    on_step()
-    found = best_stacks(
-        reading,
-        asked.world if listed is None or listed.sum() <= asked.world.max_blocks else world,
-        asked.checker,
-        number=num_samples,
-        cells=Cells.parse(cells),
-        block_list=listed,
-        inventory=there,
-        settings=search,
-        proposals=proposals,
-    )
-    on_step()
-    physics = asked.checker.physics
-    return StacksFile(
-        tuple(StackEntry(c.stack, c.verdict, c.front_iou if c.verdict.stable else 0.0) for c in found.chosen),
-        found.world,
-        target=found.target,
-        silhouette=Path(silhouette).name if isinstance(silhouette, str | Path) else None,
-        block_list=found.chosen[0].stack.counts,
-        block_list_source="search" if listed is None else "given",
-        inventory=there,
-        physics=physics.to_json(),
-        seed=seed,
-        sampler=SearchSampler(search=search).settings,
-        cell_size=physics.cell_size,
-        comment=f"stacks proposed: {found.asked[0]} by search, {found.asked[1]} by the network",
-    )
 
 
 def sample(

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import stackgen
-from stackgen.api import Model, _configured, check
+from stackgen.api import Model, check
+from stackgen.api.model import _configured
 from stackgen.errors import StackgenError
 from stackgen.geometry import mirror, silhouette
 from stackgen.io.stacks_file import read_stacks
