@@ -20,14 +20,11 @@ from stackgen.errors import StackgenError
 from stackgen.evaluation.intervals import clustered_ratio
 from stackgen.io.files import write_json
 from stackgen.io.stacks_file import StackEntry, StacksFile
-from stackgen.sim.statics.fit import overlaps_and_gaps
+from stackgen.sim.statics.fit import CLEAN, overlaps_and_gaps
 from stackgen.world import Mask
 
 if TYPE_CHECKING:
     from stackgen.protocols import StabilityChecker
-
-LIMIT = 0.01
-"""Largest overlap and gap that is called clean [cell]."""
 
 Picture = Path | Mask
 Deliver = Callable[[Picture], StacksFile]
@@ -91,7 +88,7 @@ def measured(entry: StackEntry, second: StabilityChecker) -> dict[str, Any]:
     return {
         "overlap": fit.largest_overlap,
         "gap": fit.largest_gap,
-        "clean": max(fit.largest_overlap, fit.largest_gap) <= LIMIT,
+        "clean": max(fit.largest_overlap, fit.largest_gap) <= CLEAN,
         "stands": verdict.stable,
         "same_in_both": verdict.stable == second.check(entry.stack).stable,
         "front_iou": entry.front_iou,
@@ -103,14 +100,14 @@ def row_of(pictures: Sequence[Picture], deliver: Deliver, second: StabilityCheck
     stacks: list[list[dict[str, Any]]] = []
     refused, seconds = [], 0.0
     for picture in pictures:
-        began = time.perf_counter()
+        began = time.process_time()
         try:
             entries = deliver(picture).entries
         except StackgenError as error:
             refused.append(f"{picture.name}: {error}" if isinstance(picture, Path) else str(error))
             continue
         finally:
-            seconds += time.perf_counter() - began
+            seconds += time.process_time() - began
         stacks.append([measured(entry, second) for entry in entries])
     shares = {name: clustered_ratio([sum(s[name] for s in some) for some in stacks], [len(some) for some in stacks])
               for name in ("clean", "stands", "same_in_both", "front_iou")}  # fmt: skip
@@ -141,7 +138,7 @@ def main() -> None:
     metrics = {
         "num_samples": options.num_samples,
         "seed": options.seed,
-        "limit_cells": LIMIT,
+        "clean_cells": CLEAN,
         "physics": first.physics.to_json(),
         "second_engine": second.physics.to_json(),
         "rows": rows,

@@ -319,7 +319,6 @@ def main() -> None:
             estimates = {metric: found.estimate(metric) for metric in METRICS}
             row = {"silhouettes": kind, "scenes": len(asked), "method": name, **facts}
             row |= {metric: value and value.to_json() for metric, value in estimates.items()}
-            row["seconds_per_sample"] = found.seconds_per_sample
             print(f"{kind}, {name}: " + ", ".join(f"{m} {_percent(row[m])}" for m in METRICS), flush=True)
             rows.append(row)
             rows.sort(key=lambda row: KINDS.index(row["silhouettes"]))  # stable: methods stay in order

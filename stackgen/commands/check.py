@@ -52,6 +52,8 @@ def main(
         tell("", statics)
     for number, those in enumerate(misfits, 1):
         tell(*(f"stack {number}: {misfit.text}" for misfit in those))
+    if any(misfits):
+        tell("A verdict on blocks that overlap or float is worth little: each engine moves them apart in its own way.")
     facts = [verdict_facts(entry, those) for entry, those in zip(entries, misfits, strict=True)]
     tell(physics=physics.to_json(), stacks=facts)
     if out is not None:

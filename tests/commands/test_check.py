@@ -49,6 +49,14 @@ def test_what_cannot_be_is_said_and_does_not_pass(
     assert not second["verdict"]["stands"] and second["misfits"][0].startswith(reason)
 
 
+def test_a_verdict_on_what_overlaps_is_said_to_be_worth_little(cli: Cli, tmp_path: Path) -> None:
+    file = tmp_path / "stacks.json"
+    for above, said in ((1.5, False), (1.495, False), (1.45, True), (1.55, True)):
+        file.write_text(json.dumps(stacks_json([("cube", 0, 0.5), ("cube", 0, above)])))
+        answer = cli("check", file)
+        assert answer.code == 0 and ("worth little" in answer.out) == said == ("0.05 cells" in answer.out)
+
+
 def test_a_small_gap_is_said_alone(cli: Cli, tmp_path: Path) -> None:
     file = tmp_path / "stacks.json"
     file.write_text(json.dumps(stacks_json([("cube", 0, 0.7)])))

@@ -73,9 +73,9 @@ def overlaps_and_gaps(stack: Stack) -> Fit:
     return Fit(overlap, np.maximum(-lowest, 0.0), gap)
 
 
-WORTH_SAYING, IMPOSSIBLE = 0.1, 0.25
-"""From where on a misfit is named, and from where on no such structure can be: samples lie up to 0.2 inside each
-other, and are pushed apart by the simulator [cell]."""
+CLEAN, IMPOSSIBLE = 0.01, 0.25
+"""Overlaps and gaps up to which a stack is clean, as all that is delivered is; a larger one is named. And from where on
+no such structure can be: samples lie up to 0.2 inside each other, and are pushed apart by the simulator [cell]."""
 
 
 @dataclass(frozen=True)
@@ -102,13 +102,13 @@ def describe_misfits(stack: Stack) -> list[Misfit]:
     """Name the blocks that are inside each other, in the ground or in the air."""
     fit, names = overlaps_and_gaps(stack), [f"block {i} ({name})" for i, name in enumerate(stack.names)]
     found = []
-    for i, j in np.argwhere(np.triu(fit.overlap) > WORTH_SAYING).tolist():
+    for i, j in np.argwhere(np.triu(fit.overlap) > CLEAN).tolist():
         depth = float(fit.overlap[i, j])
         found.append(Misfit("overlaps", depth, f"{names[i]} and {names[j]} are {depth:.2f} cells inside each other"))
-    for i in np.flatnonzero(fit.buried > WORTH_SAYING).tolist():
+    for i in np.flatnonzero(fit.buried > CLEAN).tolist():
         depth = float(fit.buried[i])
         found.append(Misfit("buried", depth, f"{names[i]} is {depth:.2f} cells in the ground"))
-    for i in np.flatnonzero(fit.gap > WORTH_SAYING).tolist():
+    for i in np.flatnonzero(fit.gap > CLEAN).tolist():
         depth = float(fit.gap[i])
         found.append(Misfit("floats", depth, f"{names[i]} floats {depth:.2f} cells above what is below it"))
     return found

@@ -84,4 +84,4 @@ def test_misfits_name_blocks_and_say_which_no_structure_can_have() -> None:
         ("buried", True),
         ("floats", True),
     ]
-    assert not describe_misfits(stack_of((CUBE, 0, 0.5, 0), (CUBE, 0.05, 1.47, 0)))
+    assert not describe_misfits(stack_of((CUBE, 0, 0.5, 0), (CUBE, 0.05, 1.492, 0)))
