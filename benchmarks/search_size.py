@@ -22,7 +22,7 @@ from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.data.generation.designs import DesignSettings, draw_design, realize
 from stackgen.evaluation.intervals import clustered_ratio
 from stackgen.geometry import silhouette, silhouette_iou
-from stackgen.io.files import write_atomically
+from stackgen.io.files import write_atomically, write_json
 from stackgen.stack import Stack
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Catalogue, Grid, Mask, Shape, World
 
@@ -159,6 +159,7 @@ def main() -> None:
     checker = SimulatorChecker(until_fall=True)
     methods = methods_of(checker, options.seed)
     results: dict[str, list[dict[str, Any]]] = {name: [] for name in methods}
+    metrics = {"seed": options.seed, "physics": checker.physics.to_json(), "match": MATCH, "scenes": results}
     for shapes in range(len(PAPER_CATALOGUE), len(PAPER_CATALOGUE) + len(MORE) + 1):
         for cells in CELLS:
             scenes = list(scenes_of(shapes, cells, options.scenes, options.seed))
@@ -166,7 +167,9 @@ def main() -> None:
                 asked = [scene for scene in scenes if name == "search" or scene.known]
                 results[name] += [answered(scene, method, checker) for scene in asked]
             print(f"{shapes} shapes, {cells} cells: {len(scenes)} scenes", flush=True)
-    metrics = {"seed": options.seed, "physics": checker.physics.to_json(), "match": MATCH, "scenes": results}
+            if options.out:
+                options.out.parent.mkdir(parents=True, exist_ok=True)
+                write_json(options.out, metrics)
     tables = [table(results, side) for side in SIDES]
     metrics["summary"] = {side: list(rows_of(results, side)) for side in SIDES}
     if options.picture:
