@@ -20,7 +20,8 @@ from rich.progress import track
 from benchmarks.common import argument_parser, peak_rss_mb, plain_table, report, start
 from stackgen.data.generation.deconstruction import Settled, Settler, deconstruct, surely_falls
 from stackgen.data.generation.designs import draw_design, realize
-from stackgen.data.generation.generate import GenerateSettings, template_samples
+from stackgen.data.generation.recipes import template_samples
+from stackgen.data.generation.settings import GenerateSettings
 from stackgen.data.shards import Sample, encode_shard
 from stackgen.errors import StackgenError
 from stackgen.evaluation.intervals import clustered_ratio

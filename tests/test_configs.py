@@ -19,7 +19,7 @@ from stackgen.commands.cli import VERBS
 from stackgen.commands.generate import COMMAND as GENERATE
 from stackgen.commands.parsing import own_sections, parse
 from stackgen.data.datamodule import StackDataModule
-from stackgen.data.generation.generate import GenerateSettings
+from stackgen.data.generation.settings import GenerateSettings
 from stackgen.models.block_list.module import BlockListCNN
 from stackgen.models.diffusion.module import DDPM
 from stackgen.models.weights import last_checkpoint

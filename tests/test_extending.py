@@ -14,7 +14,7 @@ import yaml
 
 from stackgen.commands.generate import COMMAND as GENERATE
 from stackgen.data.dataset import Dataset
-from stackgen.data.generation.generate import GenerateSettings
+from stackgen.data.generation.settings import GenerateSettings
 from stackgen.evaluation.metrics import METRICS, SampleScore, SceneScore
 from stackgen.models.weights import last_checkpoint
 from tests.conftest import Cli, TinyWeights

@@ -12,7 +12,8 @@ import yaml
 
 from stackgen.data.dataset import Dataset
 from stackgen.data.generation.designs import Design, DesignSettings, cells_wide, draw_design, realize
-from stackgen.data.generation.generate import GenerateSettings, template_samples
+from stackgen.data.generation.recipes import template_samples
+from stackgen.data.generation.settings import GenerateSettings
 from stackgen.data.manifest import Manifest
 from stackgen.data.shards import Sample, write_shard
 from stackgen.errors import StackgenError

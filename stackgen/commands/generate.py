@@ -10,7 +10,8 @@ from stackgen.commands.output import tell
 from stackgen.commands.parsing import Command
 from stackgen.commands.progress_bar import progress_bar
 from stackgen.data.generation.executors import ExecutorName, make_executor
-from stackgen.data.generation.generate import GenerateSettings, generate, generate_range
+from stackgen.data.generation.generate import generate, generate_range
+from stackgen.data.generation.settings import GenerateSettings
 from stackgen.data.manifest import SPLITS
 from stackgen.errors import StackgenError
 

@@ -5,7 +5,7 @@ It is made from the manifest alone, so equal datasets have equal cards; `stackge
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +28,12 @@ for sample in webdataset.WebDataset("{shard}", shardshuffle=False):
     poses = np.load(io.BytesIO(sample["poses.npy"]))  # (k, 6) x, y, z [cell] and rotation vector [rad]
     packed = np.load(io.BytesIO(sample["silhouette.npy"]))
     silhouette = np.unpackbits(packed, axis=1).astype(bool)  # {pixels} x {pixels}, first row at the top
-    meta = json.loads(sample["meta.json"])  # template, layout, removed
+    meta = json.loads(sample["meta.json"])  # {meta}
     break
 ```"""
+
+
+_META = "template, layout, removed"
 
 
 def write_card(folder: Path, manifest: Manifest, measured: Sequence[str] = ()) -> bool:
@@ -58,7 +61,8 @@ def dataset_card(manifest: Manifest, measured: Sequence[str] = ()) -> str:
     """Write the text of a card in Markdown."""
     stacks = sum(manifest.count(split) for split in SPLITS)
     example = manifest.shards[0]["file"] if manifest.shards else "train-000000.tar"
-    reading = _READING.format(shard=example, pixels=manifest.world.grid.image_size)
+    meta = "template (number of the drawing), kind, fit, best, margin" if manifest.of_drawings else _META
+    reading = _READING.format(shard=example, pixels=manifest.world.grid.image_size, meta=meta)
     sections = {
         "": _about(manifest, stacks),
         "Counts": markdown_table(
@@ -96,9 +100,10 @@ def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> st
 
 def _about(manifest: Manifest, stacks: int) -> str:
     grid = manifest.world.grid
+    what = "the drawing that it answers, which it need not match," if manifest.of_drawings else "its front silhouette"
     return (
         f"{stacks:,} stacks of at most {manifest.world.max_blocks} blocks on a {grid.width} x {grid.height} grid, each "
-        f"settled in a physics simulator, with its front silhouette ({grid.image_size} x {grid.image_size} pixels, "
+        f"settled in a physics simulator, with {what} ({grid.image_size} x {grid.image_size} pixels, "
         f"{grid.pixels_per_cell:g} a cell). For learning to build a stable structure of a given silhouette. "
         "The checksum of every shard is in `dataset.json`."
     )
@@ -108,23 +113,15 @@ def _making(manifest: Manifest) -> str:
     s = manifest.settings
     if "template" not in s:
         return "`dataset.json` does not say."
-    fill, shift = s["template"]["minimum_fill"], s["template"]["displacement"]
-    width = manifest.world.grid.width
-    accept, twice = s["accept"], " twice" if s.get("settle_twice") else ""
-    lines = [
-        f"By construction and deconstruction, seed {manifest.seed}. Rows are filled from the bottom with random blocks "
-        f"until at least {fill} of {width} cells are occupied; each block is shifted along x within "
-        f"{shift:g} cell. The design is simulated{twice} and kept if it comes to rest, no block moved by more than "
-        f"{accept['displacement']:g} cell along an axis or leaned by more than {accept['tilt']:g} rad. From what "
-        f"stands, up to {s['max_removals']} blocks are removed one at a time, and each rest is checked in the same way."
-    ]
+    what, lines = ("drawing", [_answering(manifest)]) if manifest.of_drawings else ("design", [_removing(manifest)])
     if s.get("draw"):
         lines.append(f"Of {s['stacks']:,} stacks made so, {s['draw']:,} were drawn uniformly without replacement.")
     if s.get("exclude_testset"):
-        lines.append("Designs that `testset-v1` uses, and their mirror images, are left out.")
+        more = ", its silhouettes" if manifest.of_drawings else ""
+        lines.append(f"Designs that `testset-v1` uses{more}, and their mirror images, are left out.")
     lines.append(
-        f"All stacks made from one design are in one split. Shares asked for: validation {s['validation']:g}, test "
-        f"{s['test']:g}, counted in designs."
+        f"All stacks made from one {what} are in one split. Shares asked for: validation {s['validation']:g}, test "
+        f"{s['test']:g}, counted in {what}s."
     )
     if "resplit" in s:
         split = s["resplit"]
@@ -133,6 +130,39 @@ def _making(manifest: Manifest) -> str:
             f"{split['seed']}; from the dataset with manifest hash `{split['source']}`."
         )
     return "\n".join(lines)
+
+
+def _removing(manifest: Manifest) -> str:
+    s, width = manifest.settings, manifest.world.grid.width
+    fill, shift = s["template"]["minimum_fill"], s["template"]["displacement"]
+    return (
+        f"By construction and deconstruction, seed {manifest.seed}. Rows are filled from the bottom with random blocks "
+        f"until at least {fill} of {width} cells are occupied; each block is shifted along x within "
+        f"{shift:g} cell. The design is {_accepted(s)} From what stands, up to {s['max_removals']} blocks are removed "
+        "one at a time, and each rest is checked in the same way."
+    )
+
+
+def _answering(manifest: Manifest) -> str:
+    s = manifest.settings
+    how = s["drawings"]
+    kinds = ", ".join(in_markdown(kind) for kind, weight in how["kinds"].items() if weight)
+    return (
+        f"The program draws silhouettes as people make them, seed {manifest.seed}, of these kinds: {kinds}; "
+        f"{100 * how['untidy']:g} % of them untidily. A search finds up to {how['known']} layouts for each that stand "
+        f"and fit within {how['near']:g} IoU of the best; of those that survive a tilt of {how['margin']:g} rad up to "
+        f"{how['answers']} are drawn evenly. Each is {_accepted(s)} Drawings whose best answer has an IoU below "
+        f"{how['least_fit']:g} are left out. `meta.json` names the kind of the drawing, and gives the IoU of the stack "
+        "with it, that of the best answer, and the margin [rad]."
+    )
+
+
+def _accepted(settings: Mapping[str, Any]) -> str:
+    accept, twice = settings["accept"], " twice" if settings.get("settle_twice") else ""
+    return (
+        f"simulated{twice} and kept if it comes to rest, no block moved by more than {accept['displacement']:g} cell "
+        f"along an axis or leaned by more than {accept['tilt']:g} rad."
+    )
 
 
 def _blocks(manifest: Manifest) -> str:
@@ -153,9 +183,11 @@ def _physics(manifest: Manifest) -> str:
 
 def _limits(manifest: Manifest) -> str:
     shift = manifest.settings.get("template", {}).get("displacement", 0.1)
+    within = "" if manifest.of_drawings else f", and within {shift:g} cell of a grid"
+    what = "Drawings are a program's" if manifest.of_drawings else "They are random, not what people would build"
     return (
-        "Designs are two-dimensional: all blocks stand at y = 0 with yaw 0 but for what settling does, and within "
-        f"{shift:g} cell of a grid. They are random, not what people would build. Stable means stable in this "
+        "Stacks are two-dimensional: all blocks stand at y = 0 with yaw 0 but for what settling does"
+        f"{within}. {what}. Stable means stable in this "
         "simulator: rigid blocks, one friction coefficient, uniform density, placed all at once; marginal stacks may "
         "fall under other settings. Equal settings give equal bytes on one kind of machine and one set of versions."
     )

@@ -63,6 +63,11 @@ class Manifest:
     settings: dict[str, Any]
     shards: tuple[ShardEntry, ...] = ()
 
+    @property
+    def of_drawings(self) -> bool:
+        """Whether its silhouettes are drawings that the stacks answer, and not pictures of the stacks."""
+        return self.settings.get("silhouette") == "drawing"
+
     def count(self, split: Split) -> int:
         """Count the samples of a split."""
         return sum(shard["samples"] for shard in self.shards if shard["split"] == split)

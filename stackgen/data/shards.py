@@ -191,7 +191,7 @@ _COMPRESSED = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ": "xz", b"\x28\x
 
 
 def compression_of(content: bytes) -> str | None:
-    """Name the program that compressed some bytes; None for a plain tar.
+    r"""Name the program that compressed some bytes; None for a plain tar.
 
     >>> compression_of(b"\x1f\x8b..."), compression_of(b"00000.meta.json")
     ('gzip', None)

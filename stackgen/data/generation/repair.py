@@ -12,7 +12,8 @@ from typing import Any
 from stackgen.data.card import write_card
 from stackgen.data.dataset import read_manifest
 from stackgen.data.generation.executors import Executor, make_executor
-from stackgen.data.generation.generate import REVISION, GenerateSettings, ShardTask, draw, make_shards
+from stackgen.data.generation.generate import ShardTask, draw, make_shards
+from stackgen.data.generation.settings import REVISION, GenerateSettings
 from stackgen.data.generation.workshop import PARTS, MadeShard, Workshop, disk_may_be_full
 from stackgen.data.manifest import Manifest, ShardEntry, shard_entry, shard_number
 from stackgen.data.shards import encode_shard, is_whole, iterate_shard

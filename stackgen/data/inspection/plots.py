@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from stackgen.data.card import markdown_table
 from stackgen.data.inspection.contents import SAME, Contents, distributions
+from stackgen.geometry import silhouette_iou
 from stackgen.io.files import write_atomically
 from stackgen.io.text import in_a_plot, in_markdown
 from stackgen.viz.render import Picture, contact_sheet
@@ -93,9 +94,13 @@ def draw_samples(contents: Contents, number: int = 24, seed: int = 0) -> Picture
     """
     size = min(number, len(contents.arrays))
     chosen = np.sort(np.random.default_rng(seed).choice(len(contents.arrays), size, replace=False))
-    manifest = contents.manifest
+    manifest, stacks = contents.manifest, [contents.stack(i) for i in chosen]
     title = f"{size} of {len(contents.arrays):,} stacks of {manifest.name}, drawn at random"
-    return contact_sheet(None, [contents.stack(i) for i in chosen], title=title, grid=manifest.world.grid)
+    ious: list[float | None] | None = None
+    if manifest.of_drawings:
+        targets = contents.arrays.images(chosen)
+        ious = [silhouette_iou(s, t, manifest.world.grid) for s, t in zip(stacks, targets, strict=True)]
+    return contact_sheet(None, stacks, ious=ious, title=title, grid=manifest.world.grid)
 
 
 def paragraphs(found: Mapping[str, Any], pictures: Sequence[str] = ()) -> list[str]:

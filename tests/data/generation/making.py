@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
-from stackgen.data.generation.generate import GenerateSettings
+from stackgen.data.generation.settings import GenerateSettings
 from stackgen.data.generation.workshop import MadeShard
 
 T = TypeVar("T")

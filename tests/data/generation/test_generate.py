@@ -15,15 +15,11 @@ import numpy as np
 import pytest
 
 from stackgen.data.dataset import TESTSET, Dataset
-from stackgen.data.generation import generate as module
+from stackgen.data.generation import recipes
 from stackgen.data.generation.designs import Design, DesignSettings
-from stackgen.data.generation.generate import (
-    GenerateSettings,
-    generate,
-    generate_range,
-    template_samples,
-    testset_designs,
-)
+from stackgen.data.generation.generate import generate, generate_range
+from stackgen.data.generation.recipes import fingerprint, template_samples, testset_contents
+from stackgen.data.generation.settings import GenerateSettings
 from stackgen.data.generation.workshop import MadeShard
 from stackgen.data.manifest import SPLITS, Manifest
 from stackgen.data.shards import Sample, read_shard
@@ -33,11 +29,11 @@ from stackgen.sim.checkers import AcceptLimits
 from stackgen.sim.physics import Physics
 from stackgen.sim.simulator import Simulator
 from stackgen.sim.statics.plane import StaticsMargins
-from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Catalogue, Grid, Shape
+from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Catalogue, Grid, Shape, World
 from tests.conftest import Cli
 from tests.data.generation.making import SMALL, Here, Stored, contents, copy, flip
 
-testset_designs.__test__ = False  # type: ignore[attr-defined]  # a function of the generator, not a test
+testset_contents.__test__ = False  # type: ignore[attr-defined]  # a function of the generator, not a test
 
 
 def samples_of(folder: Path) -> list[Sample]:
@@ -172,11 +168,11 @@ def test_long_lists_are_not_stored_but_still_deconstructed(simulator: Simulator)
 
 
 def test_layouts_of_the_test_set_and_their_mirror_images_are_left_out(small: Path, simulator: Simulator) -> None:
-    layouts = testset_designs(PAPER_WORLD)
+    layouts = testset_contents(PAPER_WORLD)
     frozen = list(Dataset.open(TESTSET).samples("test"))
     for sample in frozen[::25]:
         design = Design.from_key(sample.meta["layout"])
-        assert {design.key, design.mirrored(PAPER_WORLD).key} <= layouts
+        assert {design.key, design.mirrored(PAPER_WORLD).key, fingerprint(sample.silhouette[:, ::-1])} <= layouts
     assert {s.meta["layout"] for s in samples_of(small)}.isdisjoint(layouts)
     sample = samples_of(small)[0]
     number, key = sample.meta["template"], sample.meta["layout"]
@@ -192,22 +188,25 @@ def test_a_generator_that_meets_a_test_layout_leaves_it_out(
     generate(replace(SMALL, stacks=8, draw=8, validation=0, test=1, exclude_testset=False), frozen, executor=Here())
     forbidden = {sample.meta["layout"] for sample in Dataset.open(frozen).samples("test")}
     assert forbidden & {sample.meta["layout"] for sample in samples_of(small)}
-    monkeypatch.setattr(module, "TESTSET", frozen)
+    monkeypatch.setattr(recipes, "TESTSET", frozen)
     generate(replace(SMALL, stacks=12), tmp_path / "rest", executor=Here())
     found = {sample.meta["layout"] for sample in samples_of(tmp_path / "rest")}
     assert found and found.isdisjoint(forbidden)
 
 
 def test_the_test_set_is_left_out_of_catalogues_that_number_shapes_otherwise() -> None:
-    layouts = testset_designs(PAPER_WORLD)
+    def designs(world: World) -> set[str]:
+        return {name for name in testset_contents(world) if "@" in name}
+
+    layouts = designs(PAPER_WORLD)
     turned = Catalogue(PAPER_CATALOGUE.shapes[::-1])
     rows = {tuple(tuple((3 - s, left) for s, left in row) for row in Design.from_key(k).rows) for k in layouts}
-    assert testset_designs(replace(PAPER_WORLD, catalogue=turned)) == {Design(design).key for design in rows}
-    assert testset_designs(replace(PAPER_WORLD, grid=Grid(width=5))) == set()
-    shorter = testset_designs(replace(PAPER_WORLD, catalogue=Catalogue(PAPER_CATALOGUE.shapes[:2])))
+    assert designs(replace(PAPER_WORLD, catalogue=turned)) == {Design(design).key for design in rows}
+    assert designs(replace(PAPER_WORLD, grid=Grid(width=5))) == set()
+    shorter = designs(replace(PAPER_WORLD, catalogue=Catalogue(PAPER_CATALOGUE.shapes[:2])))
     assert shorter == {key for key in layouts if "2@" not in key and "3@" not in key}
     longer = Catalogue((*PAPER_CATALOGUE.shapes[:2], Shape.box("long_rectangle", 4), PAPER_CATALOGUE[3]))
-    assert testset_designs(replace(PAPER_WORLD, catalogue=longer)) == {key for key in layouts if "2@" not in key}
+    assert designs(replace(PAPER_WORLD, catalogue=longer)) == {key for key in layouts if "2@" not in key}
 
 
 # Refusals.
@@ -280,7 +279,7 @@ def test_settings_that_make_no_sense_are_refused(change: dict[str, float]) -> No
 
 
 def test_settings_that_no_stack_can_meet_end_with_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_HOPELESS", 2)
+    monkeypatch.setattr("stackgen.data.generation.generate._HOPELESS", 2)
     with pytest.raises(StackgenError, match="gave no stack"):
         generate(replace(SMALL, max_blocks=3, templates_per_shard=1), tmp_path / "none", executor=Here())
 

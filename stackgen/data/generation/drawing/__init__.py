@@ -1,0 +1,1 @@
+"""Silhouettes as people make them, drawn by the program."""
