@@ -14,14 +14,15 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.io.files import read_bytes, write_atomically
+from stackgen.io.files import write_atomically
 from stackgen.io.schemas import require_valid
+from stackgen.io.text import decode_text, parse_json, read_text
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
 from stackgen.world import PAPER_WORLD, Catalogue, Grid, Mask, World
@@ -115,10 +116,11 @@ def read_stacks(path: str | Path) -> StacksFile:
 
     Raises:
         StackgenError: If it is missing, not JSON, of another format, or says something impossible; the
-            message names the line and column, or the JSON path.
+            line names the place, as line and column or as JSON path.
     """
+    data = parse_json(_read(Path(path)), path)
     try:
-        return from_json(_parse(_text(Path(path))))
+        return from_json(data)
     except StackgenError as error:
         raise StackgenError(f"{path}: {error}") from error
 
@@ -198,56 +200,15 @@ def schema() -> dict[str, Any]:
     return json.loads(SCHEMA_PATH.read_text(encoding="utf-8"))
 
 
-def _text(path: Path) -> str:
-    try:
-        content = sys.stdin.buffer.read() if path == Path("-") else read_bytes(path)
-        text = content.decode("utf-8-sig")
-    except FileNotFoundError:
-        raise StackgenError("no such file") from None
-    except IsADirectoryError:
-        raise StackgenError("is a folder; give a stacks.json file") from None
-    except UnicodeDecodeError as error:
-        raise StackgenError(f"is not text in UTF-8 (byte {error.start}); give a stacks.json file") from None
-    except OSError as error:
-        raise StackgenError(f"cannot be read: {error.strerror or error}") from None
+def _read(path: Path) -> str:
+    """Read the text of a file or of standard input."""
+    text = decode_text(sys.stdin.buffer.read(), path) if path == Path("-") else read_text(path)
     if not text.strip():
-        raise StackgenError("is empty; a stacks file begins with " + _BEGINNING)
+        raise StackgenError(f"{path} is empty; a stacks file begins with {_BEGINNING}")
     return text
 
 
 _BEGINNING = f'{{"format": "{FORMAT}", "stacks": [...]}}'
-
-
-def _parse(text: str) -> Any:
-    """Parse JSON, without what JSON should not have: NaN, infinities, the same key twice."""
-
-    def no_constant(name: str) -> NoReturn:
-        raise StackgenError(f"holds {name}; every number must be finite")
-
-    def finite(digits: str) -> float:
-        return float(digits) if math.isfinite(float(digits)) else no_constant(digits)
-
-    def no_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        result: dict[str, Any] = {}
-        for key, value in pairs:
-            if key in result:
-                raise StackgenError(f"has the key {key!r} twice in one object; keep one")
-            result[key] = value
-        return result
-
-    try:
-        return json.loads(text, parse_float=finite, parse_constant=no_constant, object_pairs_hook=no_twins)
-    except json.JSONDecodeError as error:
-        cut = (
-            "; the file seems cut short"
-            if error.pos >= len(text.rstrip()) or error.msg.startswith("Unterminated")
-            else ""
-        )
-        raise StackgenError(f"is not JSON at line {error.lineno}, column {error.colno}: {error.msg}{cut}") from None
-    except RecursionError:
-        raise StackgenError("is nested too deeply to be a stacks file") from None
-    except ValueError:
-        raise StackgenError("holds a number with too many digits") from None
 
 
 def _validate(data: Any) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import codecs
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,8 @@ def read_text(path: str | Path) -> str:
     """
     try:
         return decode_text(read_bytes(path), path)
+    except FileNotFoundError:
+        raise StackgenError(f"{path}: no such file") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise StackgenError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
 
@@ -94,16 +97,34 @@ def parse_json(text: str, path: str | Path) -> Any:
     """Parse JSON; errors call it `path`.
 
     Raises:
-        StackgenError: If it is no JSON.
+        StackgenError: If it is no JSON, or has what JSON does not have: NaN, infinities, the same key twice.
     """
     try:
-        return json.loads(text)
+        return json.loads(text, parse_float=_finite, parse_constant=_finite, object_pairs_hook=_without_twins)
     except json.JSONDecodeError as error:
-        raise StackgenError(f"{path} is not JSON at line {error.lineno}, column {error.colno}: {error.msg}") from None
+        end = error.pos >= len(text.rstrip()) or error.msg.startswith("Unterminated")
+        where = f"line {error.lineno}, column {error.colno}: {error.msg}{'; it seems cut short' if end else ''}"
+        raise StackgenError(f"{path} is not JSON at {where}") from None
     except ValueError as error:
-        raise StackgenError(f"{path} is not JSON: {error}") from None
+        raise StackgenError(f"{path} is not JSON that is read here: {error}") from None
     except RecursionError:
         raise StackgenError(f"{path} is not JSON that is read here: it is nested too deeply") from None
+
+
+def _finite(digits: str) -> float:
+    number = float(digits)
+    if not math.isfinite(number):
+        raise ValueError(f"it holds {digits:.20}; every number must be finite")
+    return number
+
+
+def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        twin = next(name for name in names if names.count(name) > 1)
+        raise ValueError(f"it has the key {twin!r:.60} twice in one object; keep one")
+    return found
 
 
 def to_yaml(content: Any) -> str:

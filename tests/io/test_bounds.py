@@ -30,10 +30,10 @@ MERGES = "a0: &a0 {x0: 1}\n" + "".join(
 
 @pytest.mark.parametrize("bomb", [LAUGHS, MERGES, "a: &a [*a]", "[" * 100_000, "{a: " * 5_000, "a: " + "9" * 10_000])
 def test_a_bomb_is_one_line_at_once(bomb: str) -> None:
-    begin = time.monotonic()
+    begin = time.process_time()
     with pytest.raises(StackgenError, match="not YAML") as refused:
         parse_yaml(bomb, "it")
-    assert "\n" not in str(refused.value) and time.monotonic() - begin < 5
+    assert "\n" not in str(refused.value) and time.process_time() - begin < 5
 
 
 def test_the_command_line_s_reader_knows_bombs_too() -> None:

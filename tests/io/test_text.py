@@ -81,7 +81,10 @@ def test_what_is_no_yaml_is_one_line(text: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1,]", "{'a': 1}", "[" * 100_000, "9" * 5000, "nul"])
+NO_JSON = ["", "{", "[1,]", "{'a': 1}", "[" * 100_000, "9" * 5000, "nul", "[NaN]", "[1e999]", '{"a": 1, "a": 1}']
+
+
+@pytest.mark.parametrize("text", NO_JSON)
 def test_what_is_no_json_is_one_line(text: str) -> None:
     with pytest.raises(StackgenError, match=r"^file\.json is not JSON") as caught:
         parse_json(text, "file.json")
@@ -89,6 +92,6 @@ def test_what_is_no_json_is_one_line(text: str) -> None:
 
 
 def test_what_cannot_be_read_is_one_line(tmp_path: Path) -> None:
-    for path in (tmp_path / "gone", tmp_path, tmp_path / "a\0b"):
-        with pytest.raises(StackgenError, match="cannot be read"):
+    for path, why in ((tmp_path / "gone", "no such file"), (tmp_path, "Is a directory"), (tmp_path / "a\0b", "null")):
+        with pytest.raises(StackgenError, match=why):
             read_text(path)
