@@ -45,7 +45,7 @@ class Wanted:
             the best of the verified stacks for it. The folder of --out then holds silhouette.png and overlay.png, too.
         inventory: With --from_image, blocks that are available, such as cube=4,rectangle=3.
         weights: With --from_image, weights of the sampler: a name, .safetensors, .ckpt or run folder.
-        budget: With --from_image, limit of the search for stacks: a time, such as 5s, or a number of draws.
+        budget: With --from_image, limit of the search for stacks: a time, such as 5s, or a number of stacks.
         seed: Seed of the noise, and with --from_image of the stacks.
         order: Order of placing: the safest, in which every state stands, or the paper's greedy one.
         solver: Inverse-kinematics solver.

@@ -53,14 +53,14 @@ def main(
         sampler: Settings by which a diffusion model samples; the weights' own where one is null.
         verify: Verified sampling: many stacks are drawn and checked by the simulator (the default after --verify
             alone) or by statics, and the best are kept; where nothing stands, the next likely block list is tried.
-        budget: Limit for each image: a time, such as 1s; with --verify also a number of draws for each block list,
-            such as 64 (the default).
+        budget: Limit for each image: a time, such as 1s, or a number of stacks that are judged, such as 400 (the
+            default); with --verify a number of draws for each block list, such as 64 (the default).
     """
     from stackgen.api import best, load
     from stackgen.commands.sample_pictures import answer_all, of_model, result_folders
     from stackgen.io.stacks_file import StacksFile
+    from stackgen.sampling.best import within
     from stackgen.sampling.verified import Budget
-    from stackgen.search.problem import SearchSettings
     from stackgen.search.scale import Cells
     from stackgen.vision.reader import Reading
 
@@ -74,11 +74,8 @@ def main(
             raise StackgenError("--cells and --prefer belong to the search: leave out what asks for single samples")
         draw = of_model(load(weights, block_list_weights, sampler), asked, verify, budget)
     else:
-        seconds = None if budget is None else Budget.parse(budget).seconds
-        if budget is not None and seconds is None:
-            raise StackgenError(f"--budget {budget} is a number of draws, which limits --verify: give both, or a time")
         Cells.parse(cells)
-        search = SearchSettings(seconds=seconds, prefer=prefer)
+        search = within(None if budget is None else Budget.parse(budget), prefer)
 
         def draw(image: Path, reading: Reading) -> StacksFile:
             return replace(best(reading, **asked, cells=cells, search=search), silhouette=image.name)

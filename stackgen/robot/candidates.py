@@ -9,8 +9,8 @@ from stackgen.api import Model, best
 from stackgen.errors import StackgenError
 from stackgen.io.stacks_file import StacksFile
 from stackgen.robot.build import PlannedBuild
+from stackgen.sampling.best import within
 from stackgen.sampling.verified import Budget
-from stackgen.search.problem import SearchSettings
 from stackgen.stack import Stack
 from stackgen.vision.reader import Reading, filling, place
 
@@ -40,7 +40,7 @@ def stacks_of_picture(
         model: Model that predicts the block list, samples, and checks; by default search and network look for the best
             stacks together, at any scale.
         inventory: Blocks that there are, such as `cube=4,rectangle=3`.
-        budget: Time such as `5s` that finding a stack may cost; for a model also a number of draws.
+        budget: Time such as `5s`, or number of stacks, that finding a stack may cost.
         seed: Seed of the stacks.
         most: Number of blocks that there is room for where the robot takes them from: of a picture for which a stack
             needs more the next smaller scale is tried.
@@ -51,9 +51,7 @@ def stacks_of_picture(
     """
     limit = None if budget is None else Budget.parse(budget)
     if model is None:
-        if limit is not None and limit.seconds is None:
-            raise StackgenError(f"--budget {budget} is a number of draws, which limits a model's samples; give a time")
-        search = SearchSettings(seconds=None if limit is None else limit.seconds)
+        search = within(limit)
         for cells in ("auto", *map(str, SCALES)):
             found = best(reading, NUMBER, seed, inventory=inventory, cells=cells, search=search, on_step=on_step)
             if most is None or any(len(stack) <= most for stack in found.stacks):

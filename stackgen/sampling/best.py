@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
+from stackgen.names import Preference
 from stackgen.protocols import StabilityChecker
-from stackgen.sampling.verified import Candidate, best
-from stackgen.search.problem import SearchSettings
+from stackgen.sampling.verified import Budget, Candidate, best
+from stackgen.search.problem import CANDIDATES, SearchSettings
 from stackgen.search.scale import Cells, Scaled, best_scale
 from stackgen.search.solver import solve
 from stackgen.stack import Stack, layout
@@ -50,6 +51,15 @@ class Best:
     chosen: tuple[Candidate, ...]
     asked: tuple[int, int]
     late: bool = False
+
+
+def within(budget: Budget | None, prefer: Preference = "fit") -> SearchSettings:
+    """Limit the search by a budget: a time, or a number of stacks, which it judges instead of drawing them."""
+    if budget is None:
+        return SearchSettings(prefer=prefer)
+    if budget.seconds is not None:
+        return SearchSettings(seconds=budget.seconds, prefer=prefer)
+    return SearchSettings(effort=budget.draws / CANDIDATES, prefer=prefer)
 
 
 def best_stacks(

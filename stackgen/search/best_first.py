@@ -15,11 +15,10 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.search.problem import Beginning, Ints, Limits, Problem
+from stackgen.search.problem import CANDIDATES, Beginning, Ints, Limits, Problem
 from stackgen.search.rows import NEVER, Row, pack
 
 _ROWS = 150  # rows of a level that the search knows; all there are, for lists of the paper's world
-_LOOKS = 400  # beginnings that it judges, at effort 1
 _POPS = 4000  # combinations that it takes out of the queue, at effort 1
 _SPARE = 4  # stacks of which one is delivered, where the largest margin comes first
 
@@ -35,7 +34,7 @@ def best_first(problem: Problem) -> tuple[list[Beginning], bool]:
     left = np.broadcast_to(limits.most, (levels.number, len(limits.most)))
     options = pack(levels.gains, levels.widths, _ROWS, problem.depth, left if bounded else None)
     bound = _Bound(options, limits, bounded)
-    looks, pops = int(_LOOKS * settings.effort), int(_POPS * settings.effort)
+    looks, pops = int(CANDIDATES * settings.effort), int(_POPS * settings.effort)
     wanted = problem.number * (_SPARE if settings.prefer == "margin" else 1)
     worst = settings.near * float(levels.silhouette.sum())
     found: list[Beginning] = []

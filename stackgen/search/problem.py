@@ -19,6 +19,9 @@ from stackgen.world import World
 
 Ints = NDArray[np.int64]
 
+CANDIDATES = 400
+"""Stacks, whole or begun, that the search judges for a silhouette at effort 1, at most."""
+
 _MENDINGS = 1200  # squares of the numbers of blocks of the finished stacks that are made to stand by small moves
 _MENDABLE = 16  # largest number of blocks for which moves are tried
 _LONGEST_ROW = 10  # blocks of a row
@@ -29,7 +32,8 @@ class SearchSettings:
     """How long and for what the search looks.
 
     Args:
-        effort: Multiple of the combinations that are looked at, at most; the same effort gives the same answers.
+        effort: Multiple of the `CANDIDATES` that are judged, and of all other work; the same effort gives the same
+            answers.
         seconds: Time for a silhouette [s], where it is not null; the answers then depend on the machine.
         near: How much less IoU than the best answer another layout may have and be an answer too.
         prefer: What comes first: the best `fit`, or of all that fit nearly as well the largest `margin`.

@@ -255,7 +255,6 @@ def test_the_command_line_verifies_and_answers_by_its_exit_code(
     ("options", "message"),
     [
         (["--one_shot", "--budget", "1s"], "--verify"),
-        (["--budget", "64"], "--verify"),
         (["--one_shot", "--cells", "3"], "--cells"),
         (["--cells", "9"], "cells"),
         (["--verify", "--budget", "soon"], "a time, such as 1s"),
