@@ -6,20 +6,22 @@ from collections.abc import Iterator
 
 import pytest
 
-from benchmarks import fuzz
+from benchmarks.fuzz.__main__ import prepare
+from benchmarks.fuzz.kinds import KINDS
+from benchmarks.fuzz.worker import Worker
 
 
 @pytest.fixture(scope="module")
-def worker() -> Iterator[fuzz.Worker]:
-    fuzz.prepare()
-    worker = fuzz.Worker()
+def worker() -> Iterator[Worker]:
+    prepare()
+    worker = Worker()
     yield worker
     worker.process.kill()
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", fuzz.KINDS)
-def test_inputs_are_right_or_refused_in_one_line(kind: str, worker: fuzz.Worker) -> None:
+@pytest.mark.parametrize("kind", KINDS)
+def test_inputs_are_right_or_refused_in_one_line(kind: str, worker: Worker) -> None:
     for seed in range(10):
         outcome, text = worker.give(kind, seed)
         assert outcome in ("ok", "refused"), f"{kind} {seed}: {text}"

@@ -14,7 +14,7 @@ import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from stackgen.errors import StackgenError
 
@@ -128,8 +128,8 @@ _OWN_PIPES = ("/dev/fd/", "/dev/stdin", "/proc/self/fd/")
 """Where a shell puts what a command is given by `<(...)`."""
 
 
-def read_bytes(path: str | Path) -> bytes:
-    """Read a whole file; what is no file, such as a pipe that nobody writes to, is not waited for.
+def open_bytes(path: str | Path) -> BinaryIO:
+    """Open a file to read; what is no file, such as a pipe that nobody writes to, is not waited for.
 
     Raises:
         OSError: If it cannot be read.
@@ -140,7 +140,16 @@ def read_bytes(path: str | Path) -> bytes:
         kind = errno.EISDIR if Path(path).is_dir() else errno.EINVAL
         raise OSError(kind, os.strerror(kind) if kind == errno.EISDIR else "it is no regular file", str(path))
     os.set_blocking(number, True)
-    with os.fdopen(number, "rb") as file:
+    return os.fdopen(number, "rb")
+
+
+def read_bytes(path: str | Path) -> bytes:
+    """Read a whole file, as :func:`open_bytes` opens it.
+
+    Raises:
+        OSError: If it cannot be read.
+    """
+    with open_bytes(path) as file:
         return file.read()
 
 

@@ -21,7 +21,7 @@ from safetensors.torch import load, save
 from torch import Tensor, nn
 
 from stackgen.errors import StackgenError
-from stackgen.io.files import read_bytes, write_atomically, write_json
+from stackgen.io.files import open_bytes, read_bytes, write_atomically, write_json
 from stackgen.io.text import read_json
 from stackgen.world import World
 
@@ -175,7 +175,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 def _is_whole(path: Path) -> bool:
     """Compare the checksums of a checkpoint, which torch does not."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_bytes(path) as file, zipfile.ZipFile(file) as archive:
             return archive.testzip() is None
     except _DAMAGED:
         return False

@@ -1,42 +1,27 @@
-"""Fuzzing: seeded inputs of every kind that stackgen reads, and what becomes of them.
-
-Each input is run in a process with a limit of time and memory. An input is right or refused in one line; a traceback,
-a hang, the end of the process or a file that is left half written is a defect, and is printed with its seed.
-
-    python -m benchmarks.fuzz --inputs 10000 --seed 0
-    python -m benchmarks.fuzz --only weights --inputs 1 --seed 1234    # one input again
-"""
+"""The kinds of inputs, and how each is given to what reads it."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import io
 import json
-import multiprocessing
-import os
 import random
-import resource
 import shutil
-import sys
-import tempfile
-import time
 import traceback
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from benchmarks import fuzzing
-from benchmarks.common import ROOT, argument_parser, plain_table, report, start
+from benchmarks.common import ROOT
+from benchmarks.fuzz import mutations
 from stackgen.commands.cli import explain
 from stackgen.commands.cli import main as command_line
 
-OUTCOMES = ("ok", "refused", "more lines", "traceback", "hang", "died", "half-written")
-SECONDS = 20.0
-MEMORY = 6 * 2**30
 TOWERS = ROOT / "out" / "fuzz" / "towers"
+WEIGHTS = ROOT / "stackgen" / "assets" / "weights"
 VERBS = (
     *("sample", "check", "show", "capture", "build", "generate", "test", "predict"),
     *("sweep", "prefer", "report", "export"),
@@ -82,8 +67,6 @@ def parsed_only(verb: str, *words: object) -> tuple[str, str]:
 
 
 def _nothing_like(function: Callable[..., Any]) -> Callable[..., None]:
-    import functools
-
     @functools.wraps(function)
     def nothing(*_: Any, **__: Any) -> None:
         return None
@@ -111,7 +94,7 @@ def _write(path: Path, content: bytes) -> Path:
 def stacks(folder: Path, rng: random.Random) -> tuple[str, str]:
     """A stacks.json, read and sometimes drawn."""
     source = rng.choice(sorted((ROOT / "examples" / "stacks").glob("*.json")))
-    path = _write(folder / "s.json", fuzzing.mutated_json(json.loads(source.read_text()), rng))
+    path = _write(folder / "s.json", mutations.mutated_json(json.loads(source.read_text()), rng))
     if rng.random() < 0.1:
         return cli("show", path, "--out", folder / "out" / "p.png")
     from stackgen.io.stacks_file import read_stacks, to_json
@@ -126,7 +109,7 @@ def configurations(folder: Path, rng: random.Random) -> tuple[str, str]:
     source = rng.choice([path for path in paths if path.parent.name in verbs or path.parent.parent.name in verbs])
     text = source.read_text()
     verb = "fit" if "class_path" in text and "trainer" in text else "generate" if "stacks:" in text else "test"
-    path = _write(folder / "c.yaml", fuzzing.mutated_yaml(text, rng))
+    path = _write(folder / "c.yaml", mutations.mutated_yaml(text, rng))
     if verb == "fit":
         return fit_only_built("--config", path)
     return parsed_only(verb, "--config", path, *(["--out", folder / "out"] if verb == "generate" else []))
@@ -134,15 +117,15 @@ def configurations(folder: Path, rng: random.Random) -> tuple[str, str]:
 
 def found_configurations(folder: Path, rng: random.Random) -> tuple[str, str]:
     """The config.yaml beside a checkpoint of somebody else."""
-    shutil.copytree(fuzzing.BEFORE / rng.choice(["ddpm", "blocklist", "tran-reg", "tran-vae"]), folder / "run")
+    shutil.copytree(mutations.BEFORE / rng.choice(["ddpm", "blocklist", "tran-reg", "tran-vae"]), folder / "run")
     config = folder / "run" / "version_0" / "config.yaml"
-    config.write_bytes(fuzzing.mutated_yaml(config.read_text(), rng))
+    config.write_bytes(mutations.mutated_yaml(config.read_text(), rng))
     return fit_only_built("--ckpt_path", folder / "run")
 
 
 def datasets(folder: Path, rng: random.Random) -> tuple[str, str]:
     """A folder of shards: verified, split or read."""
-    data = fuzzing.dataset(folder, rng)
+    data = mutations.dataset(folder, rng)
     kind = rng.randrange(3)
     if kind == 0:
         return cli("dataset", "verify", data)
@@ -157,8 +140,9 @@ def compact(folder: Path, rng: random.Random) -> tuple[str, str]:
     """A compact dataset."""
     from stackgen.data.dataset import Dataset
 
-    content = (fuzzing.BEFORE / "towers.npz").read_bytes()
-    path = _write(folder / "d.npz", fuzzing.mutated_bytes(content, rng))
+    content = (mutations.BEFORE / "towers.npz").read_bytes()
+    changed = mutations.mutated_bytes(content, rng) if rng.random() < 0.3 else mutations.mutated_npz(content, rng)
+    path = _write(folder / "d.npz", changed)
     return call(lambda: [Dataset.open(path).split(name) for name in Dataset.open(path).splits])
 
 
@@ -167,17 +151,65 @@ def weights(folder: Path, rng: random.Random) -> tuple[str, str]:
     from stackgen.sampling.methods import load_predictor, load_sampler
 
     network = rng.choice(["ddpm-small", "blocklist-small", "tran-reg"])
-    path = fuzzing.weights(folder, rng, ROOT / "stackgen" / "assets" / "weights" / f"{network}.safetensors")
+    path = mutations.weights(folder, rng, WEIGHTS / f"{network}.safetensors")
     return call(lambda: (load_predictor if network == "blocklist-small" else load_sampler)(path))
 
 
 def checkpoints(folder: Path, rng: random.Random) -> tuple[str, str]:
     """A checkpoint of a training."""
-    from stackgen.sampling.methods import load_sampler
+    from stackgen.sampling.methods import load_predictor, load_sampler
 
-    content = (fuzzing.BEFORE / "ddpm" / "version_0" / "checkpoints" / "last.ckpt").read_bytes()
-    path = _write(folder / "last.ckpt", fuzzing.mutated_bytes(content, rng))
-    return call(lambda: load_sampler(path))
+    network = rng.choice(["ddpm", "blocklist", "tran-reg", "tran-vae"])
+    content = (mutations.BEFORE / network / "version_0" / "checkpoints" / "last.ckpt").read_bytes()
+    change = mutations.mutated_bytes if rng.random() < 0.3 else mutations.mutated_checkpoint
+    path = _write(folder / "last.ckpt", change(content, rng))
+    return call(lambda: (load_predictor if network == "blocklist" else load_sampler)(path))
+
+
+def pictures(folder: Path, rng: random.Random) -> tuple[str, str]:
+    """A picture or a depth frame, with what a user says of it."""
+    from stackgen.vision.reader import read_picture
+    from stackgen.world import PAPER_GRID
+
+    path = mutations.picture(folder, rng)
+    said: dict[str, Any] = {}
+    if rng.random() < 0.3:
+        numbers = (None, None, 0.001, 1.0, 1e-9, 1e9)
+        said = {name: rng.choice(numbers) for name in ("depth_scale", "focal", "cell_size")}
+        said |= {"as_": rng.choice(("drawing", "photo", "depth")), "which": rng.choice((None, 1, 2, 99))}
+    return call(lambda: read_picture(path, PAPER_GRID, **said))
+
+
+LINES = (
+    ("check", "FILE"),
+    ("check", "FILE", "--explain", "--quiet"),
+    ("show", "FILE", "--out", "out/p.png"),
+    ("capture", "FILE", "--out", "out/p.png"),
+    ("sample", "FILE", "--blocks", "cube=x", "--out", "out"),
+    ("build", "FILE", "--cell", "FILE", "--out", "out"),
+    ("generate", "--config", "FILE", "--out", "out"),
+    ("dataset", "verify", "FILE"),
+    ("dataset", "info", "FILE"),
+    ("dataset", "repair", "FILE"),
+    ("dataset", "split", "FILE", "--validation", "0.5", "--test", "0.1", "--out", "out"),
+    ("dataset", "export", "FILE", "--out", "out/d.npz"),
+    ("test", "--weights", "FILE", "--limit", "1", "--runs", "out"),
+    ("test", "--ckpt_path", "FILE", "--limit", "1", "--runs", "out"),
+    ("test", "--config", "FILE", "--limit", "1", "--runs", "out"),
+    ("predict", "--weights", "random-placement", "--test_set", "FILE", "--limit", "1", "--runs", "out"),
+    ("prefer", "--ckpt_path", "FILE", "--out", "out"),
+    ("report", "--config", "FILE", "--out", "out"),
+    ("sweep", "--config", "FILE", "--out", "out"),
+    ("export", "FILE", "--out", "out/w.safetensors"),
+)
+"""Command lines whose FILE is of a kind that the verb has no use for."""
+
+
+def strangers(folder: Path, rng: random.Random) -> tuple[str, str]:
+    """A command line with a file of a kind that it has no use for."""
+    verb, *words = rng.choice(LINES)
+    path = mutations.stranger(folder, rng)
+    return cli(verb, *(word.replace("FILE", str(path)) for word in words))
 
 
 def records(folder: Path, rng: random.Random) -> tuple[str, str]:
@@ -189,16 +221,16 @@ def records(folder: Path, rng: random.Random) -> tuple[str, str]:
     kind = rng.randrange(3)
     if kind == 0:
         kept = sorted((ROOT / "out" / "fuzz").glob("evaluation-*.json"))
-        path = _write(folder / "e.json", fuzzing.mutated_json(json.loads(rng.choice(kept).read_text()), rng))
+        path = _write(folder / "e.json", mutations.mutated_json(json.loads(rng.choice(kept).read_text()), rng))
         return call(lambda: read_evaluation(path))
     if kind == 1:
         cell = {"speeds": {"joint": 1.0}}
         progress = BuildProgress(("cube", "cube"), ((0.0,) * 6, (0.0,) * 6), (1, 0), cell, placed=1)
-        _write(folder / FILE, fuzzing.mutated_json({"format": FORMAT, **vars(progress)}, rng))
+        _write(folder / FILE, mutations.mutated_json({"format": FORMAT, **vars(progress)}, rng))
         return call(lambda: BuildProgress.read(folder).describe())
     (folder / "progress").mkdir()
     entry = json.loads((TOWERS / "dataset.json").read_text())["shards"][0]
-    _write(folder / "progress" / "000000.json", fuzzing.mutated_json(entry, rng))
+    _write(folder / "progress" / "000000.json", mutations.mutated_json(entry, rng))
     return call(lambda: Workshop(folder).whole(lambda line: None))
 
 
@@ -209,7 +241,7 @@ def sweeps(folder: Path, rng: random.Random) -> tuple[str, str]:
 
     text = (ROOT / "configs" / "sweeps" / "ddpm.yaml").read_text()
     if rng.random() < 0.6:
-        return parsed_only("sweep", "--config", _write(folder / "s.yaml", fuzzing.mutated_yaml(text, rng)))
+        return parsed_only("sweep", "--config", _write(folder / "s.yaml", mutations.mutated_yaml(text, rng)))
     from stackgen.training.sweeps.file import Metric, Sweep
 
     parameters: dict[str, dict[str, Any]] = {"x": {"min": 0.0, "max": 1.0}, "y": {"values": [1, 2]}}
@@ -220,7 +252,7 @@ def sweeps(folder: Path, rng: random.Random) -> tuple[str, str]:
         trial.suggest_float("x", 0, 1)
         study.tell(trial, 1.0)
     journal = next(folder.rglob("journal*"))
-    journal.write_bytes(fuzzing.mutated_bytes(journal.read_bytes(), rng))
+    journal.write_bytes(mutations.mutated_bytes(journal.read_bytes(), rng))
 
     def read() -> None:
         mend_journal(journal)
@@ -238,10 +270,12 @@ def option_strings(folder: Path, rng: random.Random) -> tuple[str, str]:
     parser = parsers_of(verb)
     assert not isinstance(parser, dict)
     known = [option for option in options_of(parser) if option not in ("--help", "-h", "--print_config")]
-    return parsed_only(verb, *fuzzing.options(known, rng))
+    return parsed_only(verb, *mutations.options(known, rng))
 
 
-KINDS: dict[str, Callable[[Path, random.Random], tuple[str, str]]] = {
+Kind = Callable[[Path, random.Random], tuple[str, str]]
+KINDS: dict[str, Kind] = {
+    "pictures": pictures,
     "stacks": stacks,
     "configurations": configurations,
     "found": found_configurations,
@@ -252,124 +286,7 @@ KINDS: dict[str, Callable[[Path, random.Random], tuple[str, str]]] = {
     "records": records,
     "sweeps": sweeps,
     "options": option_strings,
+    "strangers": strangers,
 }
-
-
-def one(kind: str, seed: int) -> tuple[str, str]:
-    """Try one input in a folder of its own, and look at what it leaves behind."""
-    folder = Path(tempfile.mkdtemp(prefix="stackgen-fuzz-"))
-    before = os.getcwd()
-    os.chdir(folder)
-    try:
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            outcome, text = KINDS[kind](folder, random.Random(f"{kind} {seed}"))
-        left = [p for p in folder.rglob("*") if p.name.endswith((".tmp", ".unfinished")) or p.name == "pwned"]
-        if left or (outcome == "refused" and (folder / "out").exists()):
-            return "half-written", f"{left or 'out'}: {text}"
-        return outcome, text
-    finally:
-        os.chdir(before)
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _work(pipe: Any) -> None:
-    """Try inputs as they come."""
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY + 8 * 2**30, MEMORY + 8 * 2**30))
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    os.dup2(1, 2)
-    import torch
-
-    torch.set_num_threads(1)
-    with contextlib.suppress(EOFError):
-        while True:
-            kind, seed = pipe.recv()
-            try:
-                answer = one(kind, seed)
-            except BaseException as error:  # noqa: BLE001 - a defect, like any other
-                answer = "traceback", "".join(traceback.format_exception(error))[-1500:]
-            pipe.send(answer)
-
-
-class Worker:
-    """A process that tries inputs, and is replaced when it hangs or dies."""
-
-    def __init__(self) -> None:
-        self._begin()
-
-    def _begin(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self.pipe, there = context.Pipe()
-        self.process = context.Process(target=_work, args=(there,), daemon=True)
-        self.process.start()
-        there.close()
-        self.known = set[str]()
-
-    def give(self, kind: str, seed: int) -> tuple[str, str]:
-        """Try one input."""
-        self.pipe.send((kind, seed))
-        limit = SECONDS + (60.0 if kind not in self.known else 0.0)  # the first of a kind loads torch and the rest
-        self.known.add(kind)
-        if not self.pipe.poll(limit):
-            self._end()
-            return "hang", f"over {limit:g} s"
-        try:
-            return self.pipe.recv()
-        except (EOFError, OSError):
-            self._end()
-            return "died", "the process ended"
-
-    def _end(self) -> None:
-        self.process.kill()
-        self.process.join()
-        self._begin()
-
-
-def prepare() -> None:
-    """Make the valid files that are no part of the repository."""
-    from tests.conftest import write_towers
-
-    shutil.rmtree(TOWERS.parent, ignore_errors=True)
-    TOWERS.mkdir(parents=True)
-    write_towers(TOWERS, {"train": 12, "validation": 4, "test": 4})
-    folder = TOWERS.parent / "runs"
-    words = ("test", "--weights", "random-placement", "--test_set", TOWERS, "--limit", 2, "--num_samples", 2)
-    with contextlib.redirect_stdout(io.StringIO()):
-        code = command_line([str(word) for word in (*words, "--runs", folder)])
-    if code != 0:
-        sys.exit(code)
-    for number, path in enumerate(folder.rglob("evaluation-*.json")):
-        shutil.copy(path, TOWERS.parent / f"evaluation-{number}.json")
-
-
-def main() -> None:
-    """Try inputs and print what became of them."""
-    parser = argument_parser("fuzz", __doc__)
-    parser.add_argument("--inputs", type=int, default=1000, help="Number of inputs, shared by the kinds.")
-    parser.add_argument("--seed", type=int, default=0, help="Seed of the first input of each kind.")
-    parser.add_argument("--only", nargs="*", choices=KINDS, default=list(KINDS), help="Kinds that are tried.")
-    options = parser.parse_args()
-    prepare()
-    worker, counts, defects, begin = Worker(), Counter[tuple[str, str]](), Counter[str](), time.perf_counter()
-    for number in range(options.inputs):
-        kind = options.only[number % len(options.only)]
-        seed = options.seed + number // len(options.only)
-        outcome, text = worker.give(kind, seed)
-        counts[kind, outcome] += 1
-        if outcome not in ("ok", "refused"):
-            last = text.strip().splitlines()[-2:] if "bug of stackgen" in text else text.strip().splitlines()[-1:]
-            defects[f"{kind}: {' | '.join(last)[:200]}"] += 1
-            print(f"--- {kind} {seed}: {outcome}\n{text[-1200:]}", flush=True)
-    rows = [[kind, *(str(counts[kind, outcome]) for outcome in OUTCOMES)] for kind in options.only]
-    metrics = {
-        "inputs": options.inputs,
-        "seed": options.seed,
-        "seconds": round(time.perf_counter() - begin, 1),
-        "outcomes": {kind: {o: counts[kind, o] for o in OUTCOMES} for kind in options.only},
-    }
-    report("fuzz", metrics, [plain_table("What became of inputs", ["kind", *OUTCOMES], rows)], options.out)
-    for line, times in defects.most_common():
-        print(f"{times} x {line}")
-
-
-if __name__ == "__main__":
-    start(main)
+SLOW = ("configurations", "found", "options", "strangers")
+"""Kinds that make a parser of a verb, which takes a second: they have a quarter of the others' inputs."""
