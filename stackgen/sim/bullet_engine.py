@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import weakref
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -70,6 +71,7 @@ class BulletEngine:
         self.number = connect(physics)
         self.molds: dict[Shape, Mold] = {}
         self.bodies: list[int] = []
+        self._end = weakref.finalize(self, bullet.disconnect, self.number)
 
     def put(self, shapes: Sequence[Shape], positions: Floats, quaternions: Floats) -> None:
         """Clear the ground and spawn blocks."""
@@ -99,8 +101,8 @@ class BulletEngine:
         return np.array([position + quaternion for position, quaternion in states]).reshape(-1, 7)
 
     def close(self) -> None:
-        """Give PyBullet's memory back."""
-        bullet.disconnect(self.number)
+        """Give PyBullet's memory back; that is done, too, when nobody holds the engine any more."""
+        self._end()
 
 
 def connect(physics: Physics, mode: int | None = None) -> int:

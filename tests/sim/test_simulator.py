@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -173,6 +174,17 @@ def test_a_closed_simulator_opens_again(physics: Physics) -> None:
     again.close()
     assert same(first, again.rollout(RUIN, record_every=10))
     again.close()
+
+
+def test_who_drops_a_simulator_gives_its_client_back() -> None:
+    bullet = pytest.importorskip("pybullet")
+    dropped = Simulator(Physics(engine="bullet"))
+    dropped.rollout(TOWER)
+    number = dropped._engine.number  # type: ignore[union-attr]
+    assert bullet.isConnected(number)
+    del dropped
+    gc.collect()
+    assert not bullet.isConnected(number)
 
 
 def test_the_engine_s_greeting_is_not_heard(physics: Physics) -> None:

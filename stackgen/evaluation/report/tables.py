@@ -221,7 +221,10 @@ def _fit(name: str) -> Text:
 
 
 def _cells(estimate: Estimate | None) -> str:
-    return "" if estimate is None else f"{estimate.value:.3f} ({estimate.low:.3f} to {estimate.high:.3f})"
+    if estimate is None:
+        return ""
+    value, low, high = (abs(depth) for depth in (estimate.value, estimate.low, estimate.high))  # no -0.000
+    return f"{value:.3f} ({low:.3f} to {high:.3f})"
 
 
 def _fit_note(results: Sequence[Result]) -> str:

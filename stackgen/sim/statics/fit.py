@@ -48,7 +48,7 @@ class Fit:
     @property
     def largest_gap(self) -> float:
         """Largest gap below a block [cell]."""
-        return float(self.gap.max(initial=0.0))
+        return float(self.gap.max(initial=0.0)) + 0.0  # not -0.0
 
 
 def overlaps_and_gaps(stack: Stack) -> Fit:
