@@ -17,7 +17,7 @@ from benchmarks.out_of_distribution import KINDS, METRICS, AlignedPredictor, sce
 if TYPE_CHECKING:
     from stackgen.evaluation.protocol import Scene
 
-DRAWN, PAPER = "drawings", "paper's recipe"
+DRAWN, PAPER = "drawings, unseen", "stacks of the paper's recipe, unseen"
 
 
 def parser() -> argparse.ArgumentParser:

@@ -1,4 +1,4 @@
-"""stackgen generate: datasets by construction and deconstruction."""
+"""stackgen generate: datasets by construction and deconstruction, or of drawings."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ def main(
     executor: ExecutorName = "local",
     shard_range: str | None = None,
 ) -> None:
-    """Make a dataset: random designs settle, then blocks are taken out of them one by one.
+    """Make a dataset: random designs settle, then blocks are taken out of them one by one; or the search answers
+    drawings, in the recipe `drawings`.
 
     An interrupted run continues where it stopped when the same command is started again. The result depends on
     the settings alone, not on the number of workers or the executor.
@@ -73,6 +74,7 @@ COMMAND = Command(
     main,
     """
     stackgen generate --config configs/generate/paper.yaml --out data/paper
+    stackgen generate --config configs/generate/drawings.yaml --out data/drawings
     stackgen generate --name small --stacks 2000 --seed 7 --out data/small --workers 2
     stackgen generate --config configs/generate/paper.yaml --out data/paper --shard_range 0:40
     """,

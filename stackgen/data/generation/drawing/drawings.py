@@ -55,8 +55,8 @@ class DrawingSettings:
     smallest: float = 1.0
     untidy: float = 0.45
     effects: Mapping[str, float] = field(default_factory=lambda: dict(_EFFECTS))
-    effort: float = 0.05
-    known: int = 8
+    effort: float = 0.2
+    known: int = 16
     answers: int = 4
     near: float = 0.02
     margin: float = 0.03
