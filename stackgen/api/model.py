@@ -150,9 +150,10 @@ class Model:
             on_step: As in :meth:`sample_checked`.
 
         Returns:
-            As :meth:`sample_checked`, the verdicts being the simulator's in any case. Its comment says what
-            was drawn and checked, that of a stack whether nothing stable was found for it.
+            As :meth:`sample_checked`, the verdicts being the simulator's in any case, and each stack as it settled. Its
+            comment says what was drawn and checked, that of a stack whether nothing stable was found for it.
         """
+        from stackgen.sampling.clean import as_settled
         from stackgen.sampling.verified import Budget, VerifiedSampler, checker_named, choose_list
 
         self._check_draw(num_samples, seed)
@@ -162,12 +163,11 @@ class Model:
         counts, choice, tried = choose_list(sampler, mask, lists, num_samples, seed)
         on_step()
         entries = []
-        for found in choice.chosen:
-            if checker is self.checker:
-                entry = StackEntry(found.stack, found.verdict, found.front_iou if found.verdict.stable else 0.0)
-            else:
-                entry = check(self.checker, found.stack, mask, self.world.grid)
-            entries.append(replace(entry, comment="" if found.verdict.stable else "nothing stable was found for it"))
+        delivered = as_settled([found.stack for found in choice.chosen], self.checker)
+        for stack, verdict in delivered:
+            front_iou = silhouette_iou(verdict.settled, mask, self.world.grid) if verdict.stable else 0.0
+            comment = "" if verdict.stable else "nothing stable was found for it"
+            entries.append(StackEntry(stack, verdict, front_iou, comment=comment))
             on_step()
         asked: dict[str, Any] = {"silhouette": silhouette, "seed": seed, "blocks": blocks, "inventory": inventory}
         file = self._file(entries, mask, counts, **asked)
