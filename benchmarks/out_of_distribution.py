@@ -56,7 +56,7 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS), help="kinds of silhouettes")
     options.add_argument("--scenes", type=int, default=50, help="scenes, evenly spread over the test set")
     options.add_argument("--num_samples", type=int, default=3, help="samples of each scene")
-    options.add_argument("--verified", action="store_true", help="add verified sampling with the last of the weights")
+    options.add_argument("--verified", action="store_true", help="add verified sampling with the last weights")
     options.add_argument("--draws", type=int, default=64, help="stacks that verified sampling may draw for a scene")
     options.add_argument("--seed", type=int, default=0, help="seed of disturbances and noise")
     options.add_argument(
@@ -274,14 +274,15 @@ def methods_of(options: argparse.Namespace, checker: StabilityChecker) -> dict[s
     from stackgen.sampling.verified import Budget, VerifiedSampler
 
     methods: dict[str, StackSampler] = {}
+    title = ""
     for name in options.weights:
         if name in OWN_LISTS:
-            methods[title := name] = OWN_LISTS[name]
+            methods[name] = OWN_LISTS[name]
             continue
         sampler = load_sampler(name)
         title = str(sampler.card.get("name", name))
         methods[title] = AlignedSampler(sampler)
-    if options.verified:
+    if options.verified and title:
         methods[f"{title}, verified"] = VerifiedSampler(methods[title], checker, Budget(options.draws))
     return methods
 
