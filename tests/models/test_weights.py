@@ -56,7 +56,7 @@ def checkpoint(path: Path, tiny: TinyWeights) -> Path:
 
 def test_weights_are_read_back_as_written(tmp_path: Path) -> None:
     tensors = {"a": torch.randn(3, 4), "b": torch.arange(5), "c": torch.randn(4, 4).t()}
-    write_weights(tmp_path / "x.safetensors", tensors, {"kind": "test", "metrics": {"m": 0.1}})
+    write_weights(tmp_path / "x.safetensors", tensors, {"kind": "test", "config": {}, "metrics": {"m": 0.1}})
     found, card = read_weights(tmp_path / "x.safetensors")
     assert found.keys() == tensors.keys() and all(torch.equal(found[k], tensors[k]) for k in tensors)
     assert card["kind"] == "test" and card["metrics"] == {"m": 0.1} and card["name"] == "x"
