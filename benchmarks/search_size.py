@@ -245,9 +245,9 @@ def draw(results: Mapping[str, Sequence[Mapping[str, Any]]], path: Path) -> None
         panels[1][column].set_xticks(range(len(groups)), groups)
         panels[1][column].set_xlabel({"cells": "cells a side"}.get(side, side))
         panels[1][column].set_yscale("log")
-    panels[0][0].set_ylabel(f"stands with IoU of {MATCH} [%]")
+    panels[0][0].set_ylabel(f"stands, IoU of {MATCH} [%]")
     panels[0][0].set_ylim(0, 105)
-    panels[1][0].set_ylabel("seconds a picture, up to the 95th percentile")
+    panels[1][0].set_ylabel("seconds, to the 95th percentile")
     panels[0][0].legend(frameon=False, loc="lower left")
     for panel in panels.flat:
         panel.spines[["top", "right"]].set_visible(False)
