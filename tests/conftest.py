@@ -118,8 +118,8 @@ class ThreeCubes:
 def towers(monkeypatch: pytest.MonkeyPatch) -> Model:
     """A model that needs no weights; `stackgen sample` uses it while the test runs."""
     model = Model(TowerSampler(), ThreeCubes())
-    for place in ("stackgen.api.load", "stackgen.api.pictures.load"):
-        monkeypatch.setattr(place, lambda *names: model)
+    monkeypatch.setattr("stackgen.api.load", lambda *names: model)
+    monkeypatch.setattr("stackgen.api.pictures._network", lambda: model)
     return model
 
 

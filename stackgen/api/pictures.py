@@ -57,13 +57,9 @@ def best(
     from stackgen.sampling.best import best_stacks
     from stackgen.sim.checkers import SimulatorChecker
 
-    @cache
-    def network() -> Model:
-        return load()
-
     def proposals(target: Mask, block_list: NDArray[np.int64] | None) -> list[Stack]:
         given = inventory if block_list is None else None
-        return network().sample_verified(target, num_samples, seed, block_list, given).stacks
+        return _network().sample_verified(target, num_samples, seed, block_list, given).stacks
 
     asked = Model(SearchSampler(), checker=SimulatorChecker())
     Model._check_draw(num_samples, seed)
@@ -73,13 +69,16 @@ def best(
     listed = None if blocks is None else Model(SearchSampler(world)).counts(blocks)
     there = None if inventory is None else asked.inventory(inventory)
     reading = silhouette if isinstance(silhouette, Reading) else read_picture(silhouette, asked.world.grid)
+    asked_cells = Cells.parse(cells)
+    if asked_cells == Cells() and reading.cell is not None:
+        asked_cells = Cells(max(1, round(len(reading.figure) / reading.cell)))
     on_step()
     found = best_stacks(
         reading,
         asked.world if listed is None or listed.sum() <= asked.world.max_blocks else world,
         asked.checker,
         number=num_samples,
-        cells=Cells.parse(cells),
+        cells=asked_cells,
         block_list=listed,
         inventory=there,
         settings=search,
@@ -103,11 +102,17 @@ def best(
     )
 
 
+@cache
+def _network() -> Model:
+    """Load the shipped weights, once."""
+    return load()
+
+
 def _told(found: Best, wanted: int) -> str:
     """Say where the stacks come from, and why they may be fewer or worse than asked."""
     told = [f"stacks proposed: {found.asked[0]} by search, {found.asked[1]} by the network"]
     if len(found.chosen) < wanted:
-        told.append(f"of {wanted} layouts {len(found.chosen)} fit nearly as well as the best")
+        told.append(f"no more than {len(found.chosen)} of {wanted} layouts fit nearly as well as the best")
     if found.late:
         told.append("the budget was up: a larger one may find better stacks")
     return "; ".join(told)

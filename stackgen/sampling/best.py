@@ -7,7 +7,7 @@ settled.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette_iou
 from stackgen.names import Preference
-from stackgen.protocols import StabilityChecker
+from stackgen.protocols import StabilityChecker, Verdict
+from stackgen.sampling.clean import as_settled
 from stackgen.sampling.verified import Budget, Candidate, best
 from stackgen.search.problem import CANDIDATES, SearchSettings
 from stackgen.search.scale import Cells, Scaled, best_scale
@@ -96,15 +97,19 @@ def best_stacks(
     at = _search(reading, world, cells, number, block_list, inventory, settings)
     late = settings.seconds is not None and time.perf_counter() - began > settings.seconds
     searched = [answer.stack for answer in at.answers]
-    found = _judged(searched, at, checker)
+    found = _candidates(zip(searched, checker.check_all(searched), strict=True), at)
     more: list[Candidate] = []
     fits = max((c.front_iou for c in found if c.verdict.stable), default=0.0) >= ENOUGH
     if proposals is not None and at.world == world and not fits:
         known = block_list if block_list is not None else searched[0].counts if searched else None
-        more = _judged(proposals(at.target, known), at, checker)
-        standing = [candidate.verdict.settled for candidate in more if candidate.verdict.stable]
-        more = _judged(standing, at, checker)
-    chosen = best([*found, *more], number)
+        settled = _candidates(as_settled(proposals(at.target, known), checker), at)
+        more = [one for one in settled if one.verdict.stable]
+    most = max((one.front_iou for one in [*found, *more] if one.verdict.stable), default=0.0)
+    ranked = [one for one in [*found, *more] if one.front_iou >= most - settings.near - 1e-9]
+    if settings.prefer == "margin":  # the search has them in that order
+        chosen = tuple(sorted(ranked, key=lambda one: not one.verdict.stable)[:number])
+    else:
+        chosen = best(ranked, number)
     if not chosen:
         way = "a larger budget" if late else "more cells, other blocks, or leave the block list out"
         raise StackgenError(f"nothing that stands was found; give {way}")
@@ -126,10 +131,10 @@ def _search(
     return Scaled(world, reading.exact, world.grid.height, tuple(answers))
 
 
-def _judged(stacks: Sequence[Stack], at: Scaled, checker: StabilityChecker) -> list[Candidate]:
+def _candidates(judged: Iterable[tuple[Stack, Verdict]], at: Scaled) -> list[Candidate]:
     grid = at.world.grid
     candidates = []
-    for stack, verdict in zip(stacks, checker.check_all(stacks), strict=True):
+    for stack, verdict in judged:
         shown = verdict.settled if verdict.stable else stack
         candidates.append(Candidate(stack, verdict, silhouette_iou(shown, at.target, grid), layout(stack, grid)))
     return candidates

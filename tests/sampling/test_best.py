@@ -13,6 +13,7 @@ from stackgen.protocols import Verdict
 from stackgen.sampling.best import ENOUGH, best_stacks
 from stackgen.search.problem import SearchSettings
 from stackgen.search.scale import Cells
+from stackgen.search.solver import solve
 from stackgen.sim.checkers import SimulatorChecker
 from stackgen.stack import Stack
 from stackgen.vision.reader import read_picture
@@ -42,12 +43,26 @@ def test_the_network_is_asked_where_nothing_fits_and_its_stacks_are_delivered_as
         ]  # the upper one floats
 
     found = best_stacks(
-        read_picture(DISC, PAPER_GRID), PAPER_WORLD, SimulatorChecker(), cells=Cells(2), number=99, proposals=proposals
+        read_picture(DISC, PAPER_GRID),
+        PAPER_WORLD,
+        SimulatorChecker(),
+        cells=Cells(2),
+        number=99,
+        settings=SearchSettings(near=1),
+        proposals=proposals,
     )
     assert len(asked) == 1 and asked[0].shape == (64, 64) and found.asked[1] == 1
     assert max(candidate.front_iou for candidate in found.chosen) < ENOUGH
     (proposed,) = [c.stack for c in found.chosen if not np.isclose(c.stack.poses[:, 2] % 0.5, 0).all()]
     assert proposed.poses[:, 2] == pytest.approx([0.5, 1.5], abs=0.01)
+
+
+def test_the_largest_margin_comes_first_where_that_is_preferred() -> None:
+    reading = read_picture(silhouette(TOWER, PAPER_GRID), PAPER_GRID)
+    settings = SearchSettings(prefer="margin")
+    found = best_stacks(reading, PAPER_WORLD, SimulatorChecker(), settings=settings)
+    wanted = solve(found.target, PAPER_WORLD, settings=settings)
+    assert [one.layout for one in found.chosen] == [answer.layout for answer in wanted]
 
 
 def test_the_checker_has_the_last_word() -> None:
