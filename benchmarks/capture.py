@@ -29,9 +29,6 @@ from stackgen.world import PAPER_GRID, Mask
 
 KINDS = ("as seen", "in cells")
 
-ALIKE = 0.85
-"""Least IoU with the stretched silhouette for a structure to count as made of whole cells."""
-
 
 @dataclass(frozen=True)
 class Case:
@@ -85,7 +82,7 @@ def case(stack: Stack, rng: np.random.Generator, model: Model) -> Case:
     seed = int(rng.integers(2**31))
     found = find_structure(simulated_frame(stack, rig, seed=seed))
     as_seen = fitted(found.front, PAPER_GRID)
-    in_whole, cells, _ = in_cells(found.front[bounding_box(found.front)], ALIKE, PAPER_GRID)
+    in_whole, cells, _ = in_cells(found.front[bounding_box(found.front)], PAPER_GRID)
     own = own_silhouette(stack)
     silhouettes = (as_seen, in_whole)
     best = [model.sample_verified(mask, 1, seed).entries[0] for mask in silhouettes]

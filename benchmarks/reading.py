@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from rich.progress import track
 
-from benchmarks.build_order import drawn
+from benchmarks.build_order import drawn, estimate
 from benchmarks.common import ROOT, argument_parser, plain_table, report, start
 from stackgen.errors import StackgenError
 from stackgen.geometry import iou, silhouette
@@ -46,6 +46,9 @@ DRAW = runpy.run_path(str(ROOT / "examples" / "draw_photos.py"))
 
 DOUBTS = ("cut off", "base line", "gap", "left open", "uncertain")
 """What a note says where it tells of a doubt rather than of what was left out."""
+
+
+OUTCOMES = ("right", "wrong", "doubted", "refused")
 
 
 @dataclass(frozen=True)
@@ -94,8 +97,9 @@ def main() -> None:
 def _in_one_part(stack: Stack) -> bool:
     """Tell whether a stack's silhouette is in one part, without holes or slits: drawn in blocks, these are not seen."""
     mask = silhouette(stack, LARGE)
-    blank = closed(mask, 6) & ~mask
-    holes = int(components(~np.pad(mask, 1), connectivity=4)[0].max()) > 1
+    whole = closed(mask, 6)
+    blank = whole & ~mask
+    holes = int(components(~np.pad(whole, 1), connectivity=4)[0].max()) > 1
     return int(components(mask)[0].max()) == 1 and not holes and np.count_nonzero(blank) < 0.004 * mask.sum()
 
 
@@ -237,12 +241,11 @@ def _answers(cases: Any, kind: str, keep: Path | None) -> Iterator[Answer]:
 
 
 def summary(answers: Sequence[Answer]) -> dict[str, Any]:
-    """Shares of the outcomes, reasons of refusals, and times."""
-    outcomes = Counter(answer.outcome for answer in answers)
+    """Shares of the outcomes with 95 % intervals, reasons of refusals, and times."""
     seconds = [answer.seconds for answer in answers]
     reasons = Counter(answer.said.partition(": ")[2].partition(";")[0] for answer in answers if answer.overlap is None)
     return {
-        **{outcome: outcomes[outcome] / len(answers) for outcome in ("right", "wrong", "doubted", "refused")},
+        **{outcome: estimate([answer.outcome == outcome for answer in answers]) for outcome in OUTCOMES},
         "refusals": dict(reasons.most_common()),
         "seconds_median": float(np.median(seconds)),
         "seconds_95": float(np.quantile(seconds, 0.95)),
@@ -255,7 +258,10 @@ def table(metrics: dict[str, Any]) -> Any:
     rows = []
     for kind in ("photos", "drawings"):
         of = metrics[kind]
-        shares = [f"{100 * of[outcome]:.1f}" for outcome in ("right", "wrong", "doubted", "refused")]
+        shares = [
+            f"{100 * share['value']:.1f} ({100 * share['low']:.1f} to {100 * share['high']:.1f})"
+            for share in (of[outcome] for outcome in OUTCOMES)
+        ]
         rows.append((kind, *shares, f"{of['seconds_median']:.2f}"))
     return plain_table("pictures read, from files of known structures", headings, rows)
 

@@ -113,7 +113,8 @@ def sheet_with(stack: Stack, photo: Photo, cell: float = 150.0) -> Picture:
         cv2.fillPoly(drawn, lines, 255)  # what is outlined within stays open
     if photo.style == "hatched":
         drawn = np.maximum(drawn, _hatched(lines, photo, rng))
-    cv2.polylines(drawn, lines, True, 255, photo.width, cv2.LINE_AA)
+    if photo.style == "blocks" or not photo.filled:
+        cv2.polylines(drawn, lines, True, 255, photo.width, cv2.LINE_AA)
     _draw_beside(sheet, drawn, photo, cell, rng)
     if photo.crayon:
         grain = cv2.GaussianBlur(rng.normal(0, 1, drawn.shape), (0, 0), 1.2)

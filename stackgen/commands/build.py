@@ -26,7 +26,8 @@ from stackgen.robot.planning.build_order import Strategy
 from stackgen.robot.planning.kinematics import SolverName
 from stackgen.robot.workcell import Grasp, Workcell
 from stackgen.stack import format_block_list
-from stackgen.vision.reader import PictureOptions, read_picture
+from stackgen.vision.options import PictureOptions
+from stackgen.vision.reader import read_picture
 from stackgen.viz.render import save_image
 from stackgen.world import PAPER_GRID
 

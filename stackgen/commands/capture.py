@@ -21,12 +21,10 @@ from stackgen.vision.cells import Ints, in_cells
 from stackgen.vision.depth import DepthFrame
 from stackgen.vision.images import Picture
 from stackgen.vision.masks import fitted
-from stackgen.vision.reader import PictureOptions, Reading, filling, place, read_picture, read_silhouette
+from stackgen.vision.options import PictureOptions
+from stackgen.vision.reader import Reading, filling, place, read_picture, read_silhouette
 from stackgen.viz.render import save_image
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Mask
-
-_ALIKE = {"drawing": 0.85, "photo": 0.75, "depth": 0.85}
-"""Least IoU with the stretched figure for it to count as made of whole cells."""
 
 _ROOM = 0.25
 """What a structure may be larger than the grid [cell]."""
@@ -132,7 +130,7 @@ def _found(reading: Reading, freehand: bool) -> tuple[Mask, list[str]]:
         high = height
     as_seen = place(reading.figure, PAPER_GRID, high) if reading.exact is None else reading.exact
     known = None if reading.cell is None else high
-    silhouette, cells, block_list = in_cells(reading.figure, _ALIKE[reading.kind], PAPER_GRID, known)
+    silhouette, cells, block_list = in_cells(reading.figure, PAPER_GRID, known)
     return (as_seen if freehand else silhouette), [*lines, *_made_of(cells, block_list)]
 
 
@@ -140,7 +138,7 @@ def _made_of(cells: Ints | None, block_list: Ints | None) -> tuple[str, ...]:
     """Draw the cells that were found in letters, and name their block list."""
     if cells is None:
         return ("not made of whole cells: the silhouette is as seen",)
-    drawn = "\n".join("  " + "".join(".#^"[cell] for cell in row) for row in cells[::-1])
+    drawn = "\n".join("  " + "".join(".#/\\"[half] for half in row) for row in cells[::-1])
     if block_list is None:
         return (f"cells:\n{drawn}",)
     return f"cells:\n{drawn}", f"block list by the heuristic: {format_block_list(block_list, PAPER_CATALOGUE)}"

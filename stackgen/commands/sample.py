@@ -13,9 +13,11 @@ from stackgen.commands.parsing import Command, Files
 from stackgen.errors import StackgenError
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.names import DEFAULT, CheckerName, Preference
+from stackgen.vision.options import PictureOptions
 
 
 def main(
+    picture: PictureOptions,
     images: list[Path],
     out: Path,
     num_samples: int = 3,
@@ -37,6 +39,7 @@ def main(
     are drawn with --one_shot or with any option that says which weights sample, or how.
 
     Args:
+        picture: What the user says of the pictures.
         images: Pictures of structures.
         out: Folder for stacks.json, stacks.png, silhouette.png, overlay.png and a GLB for each stack; several images
             get a folder each in it, beside overview.png.
@@ -80,7 +83,9 @@ def main(
         def draw(image: Path, reading: Reading) -> StacksFile:
             return replace(best(reading, **asked, cells=cells, search=search), silhouette=image.name)
 
-    return answer_all(images, folders, out, draw, verified=not (own or weights != DEFAULT) or verify is not None)
+    return answer_all(
+        images, folders, picture, out, draw, verified=not (own or weights != DEFAULT) or verify is not None
+    )
 
 
 COMMAND = Command(
@@ -94,6 +99,7 @@ COMMAND = Command(
     stackgen sample sketch.jpg --sampler.kind dpm --sampler.steps 8 --out out/sketch
     """,
     files=Files("images", "IMAGE", "Pictures of structures: PNG or JPEG, any size, colours and polarity.", many=True),
+    settings={"picture": PictureOptions},
     flags={"one_shot": "Draw single samples of the network, as the paper does."},
 )
 

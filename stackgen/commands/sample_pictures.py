@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import chain, count
 from pathlib import Path
@@ -20,6 +21,7 @@ from stackgen.io.terminal import Screen
 from stackgen.names import CheckerName
 from stackgen.sampling.verified import Budget
 from stackgen.stack import format_block_list
+from stackgen.vision.options import PictureOptions
 from stackgen.vision.reader import Reading, read_picture
 from stackgen.viz.gltf import write_glb
 from stackgen.viz.render import Picture, contact_sheet, overview, save_image
@@ -40,10 +42,16 @@ def of_model(model: Model, asked: dict[str, Any], verify: CheckerName | None, bu
     sample: Callable[..., StacksFile] = partial(model.sample_checked, **asked)
     if verify is not None:
         sample = partial(model.sample_verified, **asked, verify=verify, budget=Budget.parse(budget) if budget else None)
-    return lambda image, reading: sample(image)
+
+    def draw(image: Path, reading: Reading) -> StacksFile:
+        return replace(sample(reading.silhouette(model.world.grid)), silhouette=image.name)
+
+    return draw
 
 
-def answer_all(images: Sequence[Path], folders: Sequence[Path], out: Path, draw: Draw, verified: bool) -> int:
+def answer_all(
+    images: Sequence[Path], folders: Sequence[Path], picture: PictureOptions, out: Path, draw: Draw, verified: bool
+) -> int:
     """Answer all pictures that can be read; name the others at the end."""
     results: list[StacksFile] = []
     sheets: list[Picture] = []
@@ -55,7 +63,7 @@ def answer_all(images: Sequence[Path], folders: Sequence[Path], out: Path, draw:
             for image, folder in zip(images, folders, strict=True):
                 progress.update(task, description=image.name)
                 try:
-                    reading = read_picture(image, PAPER_GRID)
+                    reading = read_picture(image, PAPER_GRID, **vars(picture))
                     result = draw(image, reading)
                 except StackgenError as error:
                     refused.append(error if image.name in str(error) else StackgenError(f"{image}: {error}"))

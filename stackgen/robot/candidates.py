@@ -12,7 +12,7 @@ from stackgen.robot.build import PlannedBuild
 from stackgen.sampling.best import within
 from stackgen.sampling.verified import Budget
 from stackgen.stack import Stack
-from stackgen.vision.reader import Reading, filling, place
+from stackgen.vision.reader import Reading
 
 NUMBER = 3
 """Stacks that stand which are looked for in a picture: the first of them may have no safe order."""
@@ -57,8 +57,7 @@ def stacks_of_picture(
             if most is None or any(len(stack) <= most for stack in found.stacks):
                 break
     else:
-        grid, figure = model.world.grid, reading.figure
-        target = place(figure, grid, filling(figure, grid)) if reading.exact is None else reading.exact
+        target = reading.silhouette(model.world.grid)
         found = model.sample_verified(target, NUMBER, seed, inventory=inventory, budget=limit, on_step=on_step)
     standing = tuple(entry for entry in found.entries if entry.verdict is not None and entry.verdict.stable)
     standing = tuple(entry for entry in standing if most is None or len(entry.stack) <= most) or standing

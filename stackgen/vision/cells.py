@@ -1,12 +1,13 @@
 """Silhouettes as cells of the grid, each full, empty or a triangle (paper, "Block Stacking in the Real World").
 
-Legend: H x W pixels, rows and columns of cells from the lower left, S shapes.
+Each row of cells lies on the cell lines or half a cell beside them, as in a pyramid, so cells are told by their halves.
+
+Legend: H x W pixels, rows and half columns from the lower left, S shapes.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -19,19 +20,22 @@ from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, Grid, Mask
 
 Ints = NDArray[np.int64]
 
-EMPTY, FULL, TRIANGLE = range(3)
-"""The kinds of cells."""
+EMPTY, FULL, RISING, FALLING = range(4)
+"""The kinds of half cells; a triangle rises in its left half and falls in the other."""
+
+_CELLS = ((EMPTY, EMPTY), (FULL, FULL), (RISING, FALLING))  # both halves of each kind of cell
+
+ALIKE = 0.9
+"""Least IoU with the stretched figure for it to count as made of whole cells."""
+
+PIECE = 0.4
+"""Edge of a square in which cells may not differ from the figure all over [cell]: a roof is no row of cells."""
 
 NEAR = 0.3
 """The sides of a structure of whole cells are at most this far from whole numbers [cell]."""
 
-CLEARLY = 0.9
-"""Least IoU with cells at less than the largest scale, which are fewer and suit by chance."""
 
-
-def in_cells(
-    figure: Mask, alike: float, grid: Grid, high: float | None = None
-) -> tuple[Mask, Ints | None, Ints | None]:
+def in_cells(figure: Mask, grid: Grid, high: float | None = None) -> tuple[Mask, Ints | None, Ints | None]:
     """Replace a figure by the cells it is made of, where it is made of whole cells.
 
     Its scale is that at which it is most alike: three steps are three cells high, though the grid has four. Of scales
@@ -39,32 +43,34 @@ def in_cells(
 
     Args:
         figure: (h, w), cut out to its box.
-        alike: Least IoU of the cells' picture with the stretched figure for it to count as made of whole cells.
         grid: Grid of the silhouette.
         high: Height of the figure [cell] where it is known.
 
     Returns:
-        (H, W) silhouette, (rows, columns) cells and (S,) block list; without whole cells the figure as it fills the
-        grid, or as high as it is known to be, None and None.
+        (H, W) silhouette, (rows, half columns) cells and (S,) block list; without whole cells the figure as it fills
+        the grid, or as high as it is known to be, None and None.
     """
     full = filling(figure, grid) if high is None else high
     heights = [full, *range(math.ceil(full) - 1, 0, -1)] if high is None else [full]
     tried = [_as_cells(place(figure, grid, height), grid) for height in heights]
     best, cells = tried[0]
     for score, fewer in tried[1:]:
-        if score >= max(CLEARLY, best + 0.03):
+        if score >= max(ALIKE, best + 0.03):
             best, cells = score, fewer
-    if best < alike:
+    if best < ALIKE:
         return place(figure, grid, full), None, None
     whole, rows = picture_of(cells, grid), int((cells != EMPTY).any(axis=1).sum())
     return place(whole[bounding_box(whole)], grid, rows), cells, block_list_of(cells)
 
 
 def _as_cells(as_read: Mask, grid: Grid) -> tuple[float, Ints]:
-    """Find the cells nearest to a silhouette (H, W), and how alike their picture is."""
+    """Find the cells nearest to a silhouette (H, W), and how alike they are: not at all where a piece differs."""
     picture = stretched(as_read, grid)
     cells = occupancy(picture, grid)
-    return iou(picture_of(cells, grid), picture), cells
+    whole = picture_of(cells, grid)
+    piece = np.ones((round(PIECE * grid.pixels_per_cell),) * 2, np.uint8)
+    differs = cv2.erode((whole != picture).astype(np.uint8), piece).any()
+    return 0.0 if differs else iou(whole, picture), cells
 
 
 def stretched(silhouette: Mask, grid: Grid) -> Mask:
@@ -84,45 +90,56 @@ def stretched(silhouette: Mask, grid: Grid) -> Mask:
 
 
 def occupancy(silhouette: Mask, grid: Grid) -> Ints:
-    """Find the kind (height, width) of each cell of the grid: the one that it differs from least.
+    """Find the kinds (rows, half columns) of cells that a silhouette (H, W) differs from least.
 
-    A triangle has nothing on top of it.
+    A triangle has nothing on top of it, and something under it.
 
     >>> picture = np.zeros((64, 64), dtype=bool)
     >>> picture[46:60, 4:32] = True
     >>> occupancy(picture, Grid())[0].tolist()
-    [1, 1, 0, 0]
+    [1, 1, 1, 1, 0, 0, 0, 0]
     """
-    one = replace(grid, width=1, height=1)
-    patterns = {kind: picture_of(np.full((1, 1), kind), one)[_window(one, 0, 0)] for kind in (EMPTY, FULL, TRIANGLE)}
-    cells = np.zeros((grid.height, grid.width), dtype=np.int64)
+    cells = np.zeros((grid.height + 1, 2 * grid.width), dtype=np.int64)
     for row in reversed(range(grid.height)):
-        for column in range(grid.width):
-            seen = silhouette[_window(grid, row, column)]
-            wrong = {kind: np.count_nonzero(seen != pattern) for kind, pattern in patterns.items()}
-            if row + 1 < grid.height and cells[row + 1, column] != EMPTY:
-                del wrong[TRIANGLE]
-            cells[row, column] = min(wrong, key=lambda kind: wrong[kind])
-    return cells
+        rows = [_row(silhouette, grid, row, cells[row + 1], shift) for shift in (0, 1)]
+        cells[row] = min(rows, key=lambda found: found[0])[1]
+    for row in range(1, grid.height):
+        cells[row, (cells[row] >= RISING) & (cells[row - 1] == EMPTY)] = EMPTY
+    return cells[:-1]
 
 
-def _window(grid: Grid, row: int, column: int) -> tuple[slice, slice]:
-    """Return the rows and columns of a cell's pixels."""
-    scale = grid.pixels_per_cell
-    left = grid.image_size / 2 + (column - grid.width / 2) * scale
-    bottom = grid.image_size - grid.ground_margin - row * scale
-    return slice(round(bottom - scale), round(bottom)), slice(round(left), round(left + scale))
+def _row(silhouette: Mask, grid: Grid, row: int, above: Ints, shift: int) -> tuple[int, Ints]:
+    """Find the cells of a row that lie `shift` halves beside the cell lines.
+
+    Returns:
+        How many pixels differ, and the kinds (half columns,) of the halves.
+    """
+    seen = silhouette[_window(grid, row)]
+    found = np.zeros(2 * grid.width, dtype=np.int64)
+    for left in range(shift, 2 * grid.width - 1, 2):
+        tried = []
+        for kinds in _CELLS:
+            if kinds[0] != RISING or not above[left : left + 2].any():
+                found[left : left + 2] = kinds
+                tried.append((np.count_nonzero(seen != picture_of(found[None], grid)[_window(grid, 0)]), kinds))
+        found[left : left + 2] = min(tried)[1]
+    return int(np.count_nonzero(seen != picture_of(found[None], grid)[_window(grid, 0)])), found
+
+
+def _window(grid: Grid, row: int) -> slice:
+    """Return the pixels of a row of cells."""
+    bottom = grid.image_size - grid.ground_margin - row * grid.pixels_per_cell
+    return slice(round(bottom - grid.pixels_per_cell), round(bottom))
 
 
 def picture_of(cells: Ints, grid: Grid) -> Mask:
-    """Draw the silhouette (H, W) of cells (rows, columns)."""
+    """Draw the silhouette (H, W) of cells (rows, half columns)."""
     picture = np.zeros((grid.image_size,) * 2, dtype=bool)
     x, z = grid.horizontal(), grid.vertical("front")[:, None]
     for row, column in np.argwhere(cells != EMPTY):
-        middle = column + 0.5 - cells.shape[1] / 2
-        height = z - row
-        half = 0.5 if cells[row, column] == FULL else (1 - height) / 2
-        picture |= (0 <= height) & (height < 1) & (np.abs(x - middle) < half)
+        across = 2 * x + cells.shape[1] / 2 - column  # 0..1 from the left to the right of the half
+        limit = {FULL: np.ones_like(x), RISING: across, FALLING: 1 - across}[int(cells[row, column])]
+        picture |= (row <= z) & (z - row < limit) & (0 <= across) & (across < 1)
     return picture
 
 
@@ -131,14 +148,14 @@ def block_list_of(cells: Ints) -> Ints | None:
 
     Each run of full cells is covered with the longest blocks that fit.
 
-    >>> block_list_of(np.array([[1, 1, 1, 1], [0, 1, 2, 0]])).tolist()
+    >>> block_list_of(np.array([[1, 1, 1, 1, 1, 1, 1, 1], [0, 1, 1, 2, 3, 0, 0, 0]])).tolist()
     [2, 0, 1, 1]
     """
     block_list = np.zeros(len(PAPER_CATALOGUE), dtype=np.int64)
-    block_list[PAPER_CATALOGUE.index("triangle")] = np.count_nonzero(cells == TRIANGLE)
+    block_list[PAPER_CATALOGUE.index("triangle")] = np.count_nonzero(cells == RISING)
     for row in np.pad((cells == FULL).astype(int), ((0, 0), (1, 1))):
         starts, ends = np.flatnonzero(np.diff(row) == 1), np.flatnonzero(np.diff(row) == -1)
-        for length in ends - starts:
+        for length in (ends - starts) // 2:
             for name, size in (("long_rectangle", 3), ("rectangle", 2), ("cube", 1)):
                 block_list[PAPER_CATALOGUE.index(name)] += length // size
                 length %= size

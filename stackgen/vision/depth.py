@@ -53,6 +53,9 @@ JOINT = 0.010
 _EDGE = 0.12
 """Width of the strip along the picture's edge in which wall and table are looked for [share]."""
 
+_WHITE = 40_000
+"""Whole numbers beyond this are white paper rather than millimetres, or parts of one."""
+
 LARGE, SMALL = 0.6, 0.03
 """Sizes of structures that are not believed without being told the unit of the depth [m]."""
 
@@ -201,7 +204,8 @@ def is_frame(raster: Raster) -> bool:
     if not isinstance(raster, Levels) or min(raster.values.shape) < 48:
         return False
     values = raster.values[np.isfinite(raster.values)].astype(np.float64)
-    if raster.values.dtype.kind in "ui" and values.max() > 30000 and of_two_tones(as_bytes(raster.values)):
+    whole = raster.values.dtype.kind in "ui"
+    if whole and values.max() > 30000 and (of_two_tones(as_bytes(raster.values)) or np.quantile(values, 0.9) > _WHITE):
         return False
     if len(values) < 0.05 * raster.values.size:
         return raster.values.size > 100_000

@@ -90,7 +90,7 @@ def find_drawn(image: Image8) -> Drawn:
             f" pixels; at least {SMALLEST} are needed, draw or scan it larger"
         )
     tone = _resized(levels.mean(axis=2), scale)
-    like_paper = not is_flat(image) and float(np.median(tone[ink])) > float(np.median(tone[~ink]))
+    like_paper = not look_at(image).flat and float(np.median(tone[ink])) > float(np.median(tone[~ink]))
     return Drawn(ink, (difference / 255).astype(np.float32), scale, place, notes, like_paper)
 
 
@@ -292,36 +292,49 @@ def as_it_is(image: Image8, grid: Grid) -> Mask | None:
     return mask if fits(mask, grid) else None
 
 
-def is_drawing(image: Image8) -> bool:
-    """Tell a drawing from a photo without a sheet in it.
+@dataclass(frozen=True)
+class Look:
+    """What tells a drawing from a photo in a picture, less a border along its edges.
 
-    Its ground is of one colour, or it has two tones only. What a camera saw has grain: on white it is the photo of
-    paper, whatever lies in its corners.
+    Args:
+        flat: Whether neighbouring pixels are equal nearly everywhere, as drawing programs leave them and no camera.
+        two_tone: Whether it has two tones, but for grain and soft edges.
+        even: Whether the background is of one colour: most places along the picture's edge are alike.
+        on_white: Whether most of the picture's edge is light and colourless.
     """
-    if min(image.colours.shape[:2]) < 64 or image.alpha is not None or is_two_tone(image):
-        return True
-    return is_even(image) and (is_flat(image) or not _is_on_white(image))
+
+    flat: bool
+    two_tone: bool
+    even: bool
+    on_white: bool
+
+    @property
+    def sheetless(self) -> bool:
+        """Whether no sheet of paper can be in it: a picture that no camera took, or one of two tones on white."""
+        return (self.flat and (self.two_tone or self.even)) or (self.two_tone and self.on_white)
+
+    @property
+    def drawn(self) -> bool:
+        """Whether it is a drawing where no sheet of paper is in it.
+
+        Its ground is of one colour, or it has two tones only. What a camera saw has grain: on white it is the photo of
+        paper, whatever lies in its corners.
+        """
+        return self.two_tone or (self.even and (self.flat or not self.on_white))
 
 
-def _is_on_white(image: Image8) -> bool:
-    """Tell whether most of the picture's edge is light and colourless."""
-    edges = (image.colours[0], image.colours[-1], image.colours[:, 0], image.colours[:, -1])
-    tone = np.median(np.concatenate(edges), axis=0)
-    return bool(tone.min() > 140 and np.ptp(tone) < 40)
-
-
-def is_flat(image: Image8) -> bool:
-    """Tell whether neighbouring pixels are equal nearly everywhere, as a drawing program leaves them and no camera."""
-    green = image.colours[..., 1]
+def look_at(image: Image8) -> Look:
+    """Find what tells a drawing from a photo."""
+    levels, _ = _framed(*_levels(image))
+    green = levels[..., levels.shape[2] // 2]
     same = (green[1:, 1:] == green[1:, :-1]) & (green[1:, 1:] == green[:-1, 1:])
-    return float(np.count_nonzero(same)) > 0.8 * same.size
-
-
-def is_two_tone(image: Image8) -> bool:
-    """Tell whether a picture has two tones, but for grain and soft edges."""
-    red, green, blue = np.moveaxis(image.colours, 2, 0)
-    return of_two_tones(np.maximum(np.maximum(red, green), blue)) or of_two_tones(
-        np.minimum(np.minimum(red, green), blue)
+    edges = (levels[0], levels[-1], levels[:, 0], levels[:, -1])
+    tone = np.median(np.concatenate(edges), axis=0)
+    return Look(
+        flat=float(np.count_nonzero(same)) > 0.8 * same.size,
+        two_tone=any(of_two_tones(end(levels, axis=2).astype(np.uint8)) for end in (np.max, np.min)),
+        even=_is_even(levels),
+        on_white=bool(tone.min() > 140 and np.ptp(tone) < 40),
     )
 
 
@@ -340,9 +353,8 @@ def of_two_tones(values: NDArray[np.uint8]) -> bool:
     return bool(apart > _CONTRAST and beside < 0.085 * apart + 2 and beyond.mean() < 0.003)
 
 
-def is_even(image: Image8) -> bool:
-    """Tell whether the background is of one colour: most places along the picture's edge are alike."""
-    levels, _ = _framed(*_levels(image))
+def _is_even(levels: Levels) -> bool:
+    """Tell whether most places along the edge of a picture (H, W, C) are of one colour."""
     band = max(1, round(min(levels.shape[:2]) * 2 * _EDGE_BAND))
     places = [
         np.median(patch.reshape(-1, levels.shape[2]), axis=0)

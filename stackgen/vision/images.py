@@ -151,12 +151,17 @@ def _upright(image: Image) -> Image:
 
 
 def _of_image(image: Image) -> Raster:
+    from PIL import ImageFilter
+
     if image.mode in ("I", "F") or ";" in image.mode:
         return Levels(np.asarray(image))
     if min(image.size) < SMALLEST:
         raise too_small("it", *image.size)
+    dithered = image.mode == "P" and len(image.getcolors() or ()) > 2
     if image.mode not in ("L", "RGB") or "transparency" in image.info:
         image = image.convert("RGBA")  # the numbers of a palette cannot be averaged
+    if dithered:
+        image = image.filter(ImageFilter.BoxBlur(2))
     factor = max(1, max(image.size) // LARGEST)
     reduced = image.reduce(factor) if factor > 1 else image
     if reduced.mode != "RGBA":

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.vision.masks import bounding_box, closed, components, opened
+from stackgen.vision.masks import bounding_box, closed, components, extent, largest, opened
 from stackgen.world import Mask
 
 Floats = NDArray[np.float64]
@@ -162,8 +162,7 @@ def without_ground(ink: Mask) -> list[Mask]:
 
 def _off_ground(ink: Mask) -> tuple[Mask, tuple[slice, slice] | None]:
     """Remove the ground line that begins at one free end; return the rest and its box, None where there is none."""
-    rows, columns = bounding_box(ink)
-    size = max(rows.stop - rows.start, columns.stop - columns.start)
+    size = extent(ink)
     lowest, thick, alone = _lowest_runs(ink, round(0.2 * size))
     thin = alone & (thick <= max(3, 0.045 * size))
     for free in _stretches(thin, round(0.03 * size)):
@@ -173,12 +172,20 @@ def _off_ground(ink: Mask) -> tuple[Mask, tuple[slice, slice] | None]:
         body = _erased_along(ink, path, width)
         if not body.any():
             continue
-        foot = bounding_box(body)
+        foot = bounding_box(largest(body, round(0.03 * size)))
+        body = _only(body, foot)  # what else the line touches, such as the margin of ruled paper, is no part of it
         long = np.count_nonzero(path >= 0) > 1.04 * (foot[1].stop - foot[1].start)
         below = foot[0].stop - 1 <= np.median(path[path >= 0]) + 0.06 * size
         if long and below and body.sum() > 0.3 * ink.sum():
             return body, foot
     return ink, None
+
+
+def _only(mask: Mask, box: tuple[slice, slice]) -> Mask:
+    """Keep what lies in a box."""
+    kept = np.zeros_like(mask)
+    kept[box] = mask[box]
+    return kept
 
 
 def _erased_along(ink: Mask, path: NDArray[np.int64], width: float) -> Mask:
@@ -238,6 +245,13 @@ def _followed(
                 path[column] = round(row)
             column += step
     return path, width
+
+
+def without_whiskers(mask: Mask, size: int) -> Mask:
+    """Remove what is thin as a hair from something solid: lines of the paper that touch it."""
+    core = opened(mask, 0.01 * size)
+    near = cv2.distanceTransform((~core).astype(np.uint8), cv2.DIST_L2, 3) <= 0.01 * size
+    return np.asarray(near & mask) if core.any() else mask
 
 
 def hatched(ink: Mask, size: int) -> Mask:

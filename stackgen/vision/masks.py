@@ -20,6 +20,11 @@ def bounding_box(mask: Mask) -> tuple[slice, slice]:
     return slice(top, top + height), slice(left, left + width)
 
 
+def extent(mask: Mask) -> int:
+    """Return the longer edge of the smallest box around what is set [pixel]."""
+    return max(mask[bounding_box(mask)].shape)
+
+
 def components(mask: Mask, connectivity: int = 8) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
     """Label the connected parts of a mask.
 
@@ -45,6 +50,15 @@ def touches_edge(mask: Mask, reach: int) -> bool:
     """Tell whether more than a speck of a mask (H, W) lies within `reach` pixels of its edge."""
     ends = (mask[:reach], mask[-reach:], mask[:, :reach].T, mask[:, -reach:].T)
     return any(int(np.count_nonzero(end.any(axis=0))) > 3 for end in ends)
+
+
+def is_round(mask: Mask) -> bool:
+    """Tell a sun from a structure: a circle covers more of the circle around it than any square does."""
+    import cv2
+
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    _, radius = cv2.minEnclosingCircle(cv2.convexHull(np.concatenate(contours)))
+    return bool(np.count_nonzero(mask) > 0.8 * np.pi * radius**2)
 
 
 def largest(mask: Mask, gap: int) -> Mask:

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.vision.lines import bridged, hatched, with_base, without_ground
-from stackgen.vision.masks import bounding_box, components, largest, opened, touches_edge
+from stackgen.vision.lines import bridged, hatched, with_base, without_ground, without_whiskers
+from stackgen.vision.masks import bounding_box, components, extent, is_round, largest, opened, touches_edge
 from stackgen.world import Mask
 
 Ints = NDArray[np.int64]
@@ -34,11 +34,14 @@ LEAST_FACE = 0.012
 THIN_FACE = 0.035
 """Faces narrower than this, by the size of the drawing, are what a pen left between two strokes, and filled."""
 
+_SOLID = 1.3
+"""Ink that holds a disc of so many widths of the stroke as its radius is filled in: two strokes side by side do not."""
+
 LOOSE = 0.3
 """Share of the strokes that may enclose nothing before an outline counts as open."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Filled:
     """What the ink of one drawing stands for.
 
@@ -81,7 +84,7 @@ def fill(ink: Mask) -> Filled:
         StackgenError: If an outline is open.
     """
     rows, columns = bounding_box(ink)
-    size = max(rows.stop - rows.start, columns.stop - columns.start)
+    size = extent(ink)
     margin = round(0.12 * size) + 2
     work = np.pad(ink[rows, columns], margin)
     found = _mended(work, size)
@@ -149,31 +152,19 @@ def _trial(ink: Mask, size: int, gap: float) -> _Trial:
     large = inside & (faces.areas > LEAST_FACE * box)
     # Flecks between hatches are filled, but say nothing of outlines.
     stroke = _stroke(faces, large)
-    whole = inside[faces.labels] if stroke else _without_whiskers(faces.ink | inside[faces.labels], size)
+    whole = inside[faces.labels] if stroke else without_whiskers(faces.ink | inside[faces.labels], size)
     if stroke:
-        whole |= opened(drawn, 0.95 * stroke)
+        whole |= opened(drawn, _SOLID * stroke)
     enclosed = int(faces.areas[large].sum())
     return _Trial(whole, stroke, _loose(faces.ink, whole, stroke), gap, enclosed, doors)
-
-
-def _without_whiskers(mask: Mask, size: int) -> Mask:
-    """Remove what is thin as a hair from something solid: lines of the paper that touch it."""
-    core = opened(mask, 0.01 * size)
-    near = cv2.distanceTransform((~core).astype(np.uint8), cv2.DIST_L2, 3) <= 0.015 * size
-    return np.asarray(near & mask) if core.any() else mask
 
 
 def _loose(ink: Mask, whole: Mask, stroke: float) -> float:
     """Return the share of the strokes that bound nothing of the whole."""
     if not stroke:
-        return 0.0 if opened(ink, 0.5 * STROKE * _extent(ink)).sum() > 0.3 * ink.sum() else 1.0
+        return 0.0 if opened(ink, 0.5 * STROKE * extent(ink)).sum() > 0.3 * ink.sum() else 1.0
     far = cv2.distanceTransform((~whole).astype(np.uint8), cv2.DIST_L2, 3)
     return float(np.count_nonzero(ink & (far > stroke)) / np.count_nonzero(ink))
-
-
-def _extent(ink: Mask) -> int:
-    rows, columns = bounding_box(ink)
-    return max(rows.stop - rows.start, columns.stop - columns.start)
 
 
 def _stroke(faces: _Faces, outlined: NDArray[np.bool_]) -> float:
@@ -284,10 +275,12 @@ RIVAL = 0.2
 TOGETHER = 0.07
 """What is nearer than this, by the size of the largest part, is one drawing."""
 
+_SURE = 0.8  # a drawing without any of its ground line counts from this sureness on
+_EDGE = 0.02  # what is nearer to the sheet's edge runs off it, by its longer edge
 _LEVEL = 0.06  # feet of one structure are level to within this, by its size
 
 
-def choose(ink: Mask, which: int | None = None, spread: bool = False) -> Filled:
+def choose(ink: Mask, which: int | None = None, spread: bool = False, framed: bool = True) -> Filled:
     """Find the drawing among all that the ink (H, W) shows, and fill it.
 
     A name, a sun, a ground line are left out.
@@ -295,25 +288,22 @@ def choose(ink: Mask, which: int | None = None, spread: bool = False) -> Filled:
     Args:
         ink: All that is drawn.
         which: Number of the drawing, from the left; None where there is one.
-        spread: Whether what stands apart on the same ground is one structure.
+        spread: Whether what stands apart on the same ground is one structure, which may be cropped to its edges.
+        framed: Whether what runs off is left out, where something else is drawn.
 
     Raises:
         StackgenError: If there are several drawings and none is asked for, fewer than asked for, or an outline is open.
     """
     groups = _groups(ink)
     found = [_one(group) for group in groups]
-    drawings = [part for part in found if isinstance(part, Filled)]
-    refused = {
-        _width(group): part
-        for group, part in zip(groups, found, strict=True)
-        if not isinstance(part, Filled) and (spread or not touches_edge(group, len(ink) // 60))
-    }
-    if not drawings and not refused:
-        raise StackgenError("nothing but what runs off the sheet is seen; leave some blank paper around the drawing")
-    if refused and (not drawings or max(refused) > max(_width(part.mask) for part in drawings)):
-        raise refused[max(refused)]  # never a name beside an outline that is open
+    seen = list(zip(groups, found, strict=True))
+    if framed:
+        inner = [pair for pair in seen if not _at_edge(*pair)]
+        seen = inner if not spread or _most(inner) > RIVAL * _most(seen) else seen
+    drawings = _that_can_be_read(seen, cut=len(seen) < len(found))
     if not spread:
-        drawings = [replace(part, mask=_main_part(part.mask)) for part in drawings]
+        # A name is drawn near the structure, too: what is not right beside its largest part is left out.
+        drawings = [replace(one, mask=largest(one.mask, round(0.03 * extent(one.mask)))) for one in drawings]
     most = max(np.count_nonzero(part.mask) for part in drawings)
     rivals = [part for part in drawings if np.count_nonzero(part.mask) >= RIVAL * most]
     rivals.sort(key=lambda part: bounding_box(part.mask)[1].start)
@@ -322,14 +312,11 @@ def choose(ink: Mask, which: int | None = None, spread: bool = False) -> Filled:
             raise StackgenError(f"which must lie in 1..{len(rivals)}, the number of drawings there are, got {which}")
         return rivals[which - 1]
     main = max(drawings, key=lambda part: np.count_nonzero(part.mask))
-    rivals = [part for part in rivals if part is main or not _is_round(part.mask)]
-    if not spread:  # what runs off the photo is the table
-        rivals = [part for part in rivals if part is main or not touches_edge(part.mask, len(ink) // 60)]
     beside = [part for part in drawings if part is not main and spread and _is_level(part.mask, main.mask)]
-    rivals = [part for part in rivals if not any(part is other for other in beside)]
-    if len(rivals) > 1:
+    rivals = [part for part in rivals if not (part is main or part in beside or is_round(part.mask))]
+    if rivals:
         raise StackgenError(
-            f"{len(rivals)} drawings are in it; cover or crop all but one, or say which one counts, from the left"
+            f"{len(rivals) + 1} drawings are in it; cover or crop all but one, or say which one counts, from the left"
             " (--which 1)"
         )
     left_out = len(found) - 1 - len(beside)
@@ -338,6 +325,28 @@ def choose(ink: Mask, which: int | None = None, spread: bool = False) -> Filled:
     for part in beside:
         mask |= part.mask
     return Filled(mask, main.stroke, notes, main.sureness * (0.95 if left_out else 1.0))
+
+
+def _that_can_be_read(seen: list[tuple[Mask, Filled | StackgenError]], cut: bool) -> list[Filled]:
+    """Return the drawings among groups of ink (H, W), where no larger one is open, or was cut off by the edge."""
+    drawings = [part for _, part in seen if isinstance(part, Filled)]
+    refused = {_width(group): part for group, part in seen if isinstance(part, StackgenError)}
+    if cut and (not seen or (not refused and all(is_round(part.mask) for part in drawings))):
+        raise StackgenError("the drawing runs off the sheet; leave some blank paper around it")
+    if refused and (not drawings or max(refused) > max(_width(part.mask) for part in drawings)):
+        raise refused[max(refused)]  # never a name beside an outline that is open
+    return drawings
+
+
+def _most(pairs: list[tuple[Mask, Filled | StackgenError]]) -> int:
+    """Return the area of the largest drawing [pixel]."""
+    return max((int(np.count_nonzero(part.mask)) for _, part in pairs if isinstance(part, Filled)), default=0)
+
+
+def _at_edge(group: Mask, part: Filled | StackgenError) -> bool:
+    """Tell whether what was found in a group of ink (H, W) runs off the sheet, as drawings may and the table does."""
+    mask = part.mask if isinstance(part, Filled) else group
+    return touches_edge(mask, round(_EDGE * max(mask.shape)))
 
 
 def _width(mask: Mask) -> int:
@@ -350,7 +359,9 @@ def _groups(ink: Mask) -> list[Mask]:
     labels, areas = components(ink)
     boxes = [bounding_box(labels == number) for number in np.argsort(areas)[::-1][:5] if areas[number]]
     size = max(max(rows.stop - rows.start, columns.stop - columns.start) for rows, columns in boxes)
-    far = cv2.distanceTransform((~ink).astype(np.uint8), cv2.DIST_L2, 3)
+    blank, _ = components(np.pad(~ink, 1, constant_values=True), connectivity=4)
+    within = blank[1:-1, 1:-1] != blank[0, 0]  # what an outline encloses belongs to it
+    far = cv2.distanceTransform((~(ink | within)).astype(np.uint8), cv2.DIST_L2, 3)
     groups, _ = components(far <= TOGETHER * size / 2)
     groups = np.where(ink, groups, 0)
     parts = [groups == number for number in range(1, int(groups.max()) + 1)]
@@ -361,7 +372,8 @@ def _one(group: Mask) -> Filled | StackgenError:
     """Fill one group of ink, without the ground line under it; the error if its outline is open."""
     note = "The ground line was left out."
     bodies = [filled for filled in map(_filled, without_ground(group)) if filled is not None]
-    sure = [filled for filled in bodies if filled.sureness > 0.95]
+    most = max((np.count_nonzero(filled.mask) for filled in bodies), default=0)
+    sure = [filled for filled in bodies if filled.sureness > _SURE and np.count_nonzero(filled.mask) > 0.75 * most]
     if bodies:
         chosen = sure[0] if sure else max(bodies, key=lambda filled: filled.sureness)
         return replace(chosen, notes=(*chosen.notes, note))
@@ -378,21 +390,6 @@ def _filled(ink: Mask) -> Filled | None:
         return None
 
 
-def _main_part(mask: Mask) -> Mask:
-    """Keep the largest part of a mask and what is right beside it: a name is drawn near the structure, too."""
-    rows, columns = bounding_box(mask)
-    return largest(mask, round(0.03 * max(rows.stop - rows.start, columns.stop - columns.start)))
-
-
-def _is_round(mask: Mask) -> bool:
-    """Tell a sun from a structure: a circle covers more of the circle around it than any square does."""
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    _, radius = cv2.minEnclosingCircle(cv2.convexHull(np.concatenate(contours)))
-    return bool(np.count_nonzero(mask) > 0.8 * np.pi * radius**2)
-
-
 def _is_level(part: Mask, main: Mask) -> bool:
     """Tell whether two parts (H, W) stand on one ground."""
-    rows, columns = bounding_box(main)
-    size = max(rows.stop - rows.start, columns.stop - columns.start)
-    return abs(bounding_box(part)[0].stop - rows.stop) <= _LEVEL * size
+    return abs(bounding_box(part)[0].stop - bounding_box(main)[0].stop) <= _LEVEL * extent(main)

@@ -9,17 +9,19 @@ Legend: h x w pixels of the photo, H x W of the sheet seen straight on.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from stackgen.errors import StackgenError
 from stackgen.vision.images import Picture
 from stackgen.vision.lines import strong, without_rules
 from stackgen.vision.masks import components
-from stackgen.vision.sheets import Sheet, least_channel, straightened
+from stackgen.vision.sheets import FOCAL, Sheet, least_channel, straightened
 from stackgen.world import Mask
 
 Floats = NDArray[np.float64]
@@ -32,6 +34,12 @@ FAINTEST = 0.1
 
 BESIDE = 0.045
 """Strokes are narrower than this, by the sheet's longer edge."""
+
+_HELD = np.radians([25.0, 8.0, 12.0])
+"""How far a camera is usually turned about its axes to the right, down and ahead, before a sheet [rad]."""
+
+_STRAY = np.radians(2.0)
+"""How far a hand turns a side that is as long as the drawing [rad]."""
 
 _DARKER_THAN_SHADOW = 0.33  # share of the light of the paper
 
@@ -69,7 +77,7 @@ def read_page(photo: Picture, sheet: Sheet | None) -> Page:
         straight = np.asarray(cv2.resize(photo, None, fx=factor, fy=factor, interpolation=how), np.uint8)
         turn = np.diag([factor, factor, 1.0])
     else:
-        straight, turn = straightened(photo, sheet.corners, WORK_SIZE)
+        straight, turn = straightened(photo, sheet, WORK_SIZE)
     ink, darkness = find_ink(straight)
     if sheet is not None:
         _clear_edge(ink)
@@ -128,3 +136,61 @@ def _clear_edge(ink: Mask) -> None:
     margin = max(2, round(_MARGIN * max(ink.shape)))
     ink[:margin] = ink[-margin:] = False
     ink[:, :margin] = ink[:, -margin:] = False
+
+
+def straight_up(mask: Mask) -> Mask:
+    """Turn a drawing (H, W) until its sides are level and upright, as those of blocks are.
+
+    It stands for the sheet where no edges of one are seen: the drawing's own sides tell how the camera was held, which
+    is looked for by least squares among usual ways to hold it.
+    """
+    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    size = max(max(cv2.boundingRect(contour)[2:]) for contour in contours)
+    sides = _sides(contours, size)
+    middle, focal = np.array(mask.shape[::-1]) / 2, FOCAL * max(mask.shape)
+    lengths = np.linalg.norm(sides[:, 1] - sides[:, 0], axis=1)
+    upright = np.abs(_angles(sides)) > np.pi / 4
+    weights = np.sqrt(lengths / size) / _STRAY
+
+    def off(turns: Floats) -> Floats:
+        """How far sides are from level or upright, and how unusual the turns of the camera [rad] are."""
+        angles = _angles(_seen_turned(sides, turns, middle, focal))
+        wrong = np.where(upright, np.abs(angles) - np.pi / 2, angles)
+        return np.concatenate([weights * wrong, turns / _HELD])
+
+    turns = np.asarray(least_squares(off, np.zeros(3), loss="soft_l1").x)
+    around = np.concatenate(contours)[:, 0].astype(np.float64)
+    there = _seen_turned(around, turns, middle, focal)
+    low, high = there.min(axis=0), there.max(axis=0)
+    scale, edge = 0.8 * max(mask.shape) / max(float((high - low).max()), 1.0), 0.1 * max(mask.shape)
+    corners = np.array([[0, 0], [mask.shape[1], 0], mask.shape[::-1], [0, mask.shape[0]]], np.float64)
+    goal = (_seen_turned(corners, turns, middle, focal) - low) * scale + edge
+    turn = cv2.getPerspectiveTransform(corners.astype(np.float32), goal.astype(np.float32))
+    width, height = np.round((high - low) * scale + 2 * edge).astype(int)
+    turned = np.asarray(cv2.warpPerspective(mask.astype(np.float32), turn, (int(width), int(height)))) >= 0.5
+    return turned if turned.any() else mask
+
+
+def _sides(contours: Sequence[cv2.typing.MatLike], size: int) -> Floats:
+    """Return the ends (n, 2, 2) of the long straight sides that are nearly level or upright."""
+    found = []
+    for contour in contours:
+        points = cv2.approxPolyDP(contour, 0.02 * size, True)[:, 0].astype(np.float64)
+        found.append(np.stack([points, np.roll(points, -1, axis=0)], axis=1))
+    sides = np.concatenate(found)
+    angles = np.abs(_angles(sides))
+    near = np.minimum(angles, np.pi / 2 - angles) < np.radians(25)
+    return np.asarray(sides[near & (np.linalg.norm(sides[:, 1] - sides[:, 0], axis=1) > 0.12 * size)])
+
+
+def _angles(sides: Floats) -> Floats:
+    """Return the angles (n,) of sides (n, 2, 2) above the horizontal, whichever way they go [-pi / 2..pi / 2]."""
+    x, y = (sides[:, 1] - sides[:, 0]).T
+    return np.asarray(np.arctan(y / np.where(x == 0, 1e-9, x)))
+
+
+def _seen_turned(points: Floats, turns: Floats, middle: Floats, focal: float) -> Floats:
+    """Return where points (..., 2) [pixel] are seen when the camera is turned about its three axes [rad]."""
+    turn, _ = cv2.Rodrigues(turns)
+    rays = np.concatenate([(points - middle) / focal, np.ones((*points.shape[:-1], 1))], axis=-1) @ turn.T
+    return np.asarray(rays[..., :2] / np.maximum(rays[..., 2:], 0.05) * focal + middle)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, get_args
 
 import cv2
 import numpy as np
@@ -21,10 +21,11 @@ from stackgen.vision import depth, drawings, images
 from stackgen.vision.depth import DepthFrame
 from stackgen.vision.images import Image8, Picture
 from stackgen.vision.lines import without_rules
-from stackgen.vision.masks import bounding_box, filling, place, touches_edge
-from stackgen.vision.outlines import Filled, choose
-from stackgen.vision.photos import WORK_SIZE, read_page
-from stackgen.vision.sheets import Sheet, find_sheet, straight_up
+from stackgen.vision.masks import bounding_box, filling, place
+from stackgen.vision.options import PictureKind, PictureOptions
+from stackgen.vision.outlines import choose
+from stackgen.vision.photos import read_page, straight_up
+from stackgen.vision.sheets import Sheet, find_sheet
 from stackgen.world import Grid, Mask
 
 if TYPE_CHECKING:
@@ -32,10 +33,11 @@ if TYPE_CHECKING:
 
 __all__ = ["PictureKind", "PictureOptions", "Reading", "filling", "place", "read_picture", "read_silhouette"]
 
-PictureKind = Literal["drawing", "photo", "depth"]
-
 FIGURE = 512
 """Longer edge of a figure [pixel], about."""
+
+LEAST_PHOTO = 64
+"""Least edge of a photo [pixel]."""
 
 _UNCLEAR = (
     "it seems to be the photo of a sheet whose edges are not clear;"
@@ -44,6 +46,9 @@ _UNCLEAR = (
 
 _LEFT_OUT = 0.05
 """Share of the structure from which on what was left out, or added, is worth telling."""
+
+_STRAY = 0.025
+"""How far a hand strays from a straight side, by the size of the drawing."""
 
 _GREEN = (20, 160, 60)
 _RED = (214, 39, 40)
@@ -81,25 +86,11 @@ class Reading:
         kinds = {"drawing": "drawing", "photo": "photo of a sketch", "depth": "depth frame"}
         return f"{kinds[self.kind]} (confidence {self.confidence:.0%})"
 
-
-@dataclass(frozen=True)
-class PictureOptions:
-    """What the user says of a picture, as arguments of :func:`read_picture`.
-
-    Args:
-        as_: What to take the picture for; told by default.
-        which: Number of the drawing, from the left, where there are several.
-        depth_scale: Metres of a step of a depth frame's values, such as 0.00025; by default whole numbers are
-            millimetres and others are metres.
-        focal: Focal length of a depth frame [pixel]; that of a RealSense D435 by default.
-        cell_size: Edge of a cube before a depth camera [m], with which the structure keeps its scale.
-    """
-
-    as_: PictureKind | None = None
-    which: int | None = None
-    depth_scale: float | None = None
-    focal: float | None = None
-    cell_size: float | None = None
+    def silhouette(self, grid: Grid) -> Mask:
+        """Return the silhouette (image_size, image_size), scaled until it fills a grid, or as the picture has it."""
+        if self.exact is not None and len(self.exact) == grid.image_size:
+            return self.exact
+        return place(self.figure, grid, filling(self.figure, grid))
 
 
 def read_picture(
@@ -137,15 +128,19 @@ def read_picture(
         return _of_frame(source, True, cell_size)
     try:
         raster = images.load(source)
-        if as_ == "depth" or (as_ is None and depth.is_frame(raster)):
+        if as_ == "depth" or (as_ is None and (depth_scale is not None or depth.is_frame(raster))):
             beside = None if colour is None else read_colours(colour)
             frame = depth.as_frame(raster, depth_scale, focal, beside)
             return _of_frame(frame, depth_scale is not None, cell_size)
         image = raster if isinstance(raster, Image8) else images.as_picture(raster)
-        sheet = None if as_ == "drawing" else _sheet(image)
-        if as_ == "photo" or (as_ is None and (sheet is not None or not drawings.is_drawing(image))):
-            return _of_photo(image, sheet, which)
-        return _of_drawing(image, grid, which, insisted=as_ is not None)
+        look = drawings.look_at(image)
+        drawn = image.alpha is not None or look.sheetless or min(image.colours.shape[:2]) < LEAST_PHOTO
+        sheet = None if as_ == "drawing" or drawn else find_sheet(image.colours)
+        if look.two_tone and sheet is not None and not sheet.whole:
+            sheet = None  # in a crop of two tones the ground is cut off just so
+        if as_ == "photo" or (as_ is None and not drawn and (sheet is not None or not look.drawn)):
+            return _of_photo(image, sheet, look.even, which)
+        return _of_drawing(image, grid, which, look.flat, insisted=as_ is not None)
     except StackgenError as error:
         raise StackgenError(f"{images.name_of(source)}: {error}") from error
 
@@ -164,8 +159,7 @@ def read_silhouette(source: str | Path | ArrayLike | Image, grid: Grid) -> Mask:
     >>> placed.shape, int(placed.sum()), int(placed[59].sum())
     ((64, 64), 784, 14)
     """
-    reading = read_picture(source, grid)
-    return place(reading.figure, grid, filling(reading.figure, grid)) if reading.exact is None else reading.exact
+    return read_picture(source, grid).silhouette(grid)
 
 
 def read_colours(path: str | Path) -> Picture:
@@ -181,18 +175,11 @@ def read_colours(path: str | Path) -> Picture:
         raise StackgenError(f"{path}: {error}") from error
 
 
-def _sheet(image: Image8) -> Sheet | None:
-    """Find the sheet in what may be a photo: a picture of two even tones, or with transparent parts, is none."""
-    if image.alpha is not None or (drawings.is_flat(image) and drawings.is_two_tone(image)):
-        return None
-    return find_sheet(image.colours)
-
-
-def _of_drawing(image: Image8, grid: Grid, which: int | None, insisted: bool) -> Reading:
-    """Read a drawing on an even ground."""
+def _of_drawing(image: Image8, grid: Grid, which: int | None, flat: bool, insisted: bool) -> Reading:
+    """Read a drawing on an even ground; what is not flat may be a photo, at whose edges a table shows."""
     drawn = drawings.find_drawn(image)
     ink, _ = without_rules(drawn.ink, drawn.darkness)
-    found = choose(ink, which, spread=True)
+    found = choose(ink, which, spread=True, framed=not flat)
     if not insisted and not found.stroke and drawn.drawn_on(found.mask):
         raise StackgenError(_UNCLEAR)
     sure = found.sureness * (0.8 if drawn.notes else 1.0)
@@ -202,17 +189,15 @@ def _of_drawing(image: Image8, grid: Grid, which: int | None, insisted: bool) ->
     return Reading(_figure(found.mask), "drawing", sure, overlay, (*drawn.notes, *found.notes), exact=exact)
 
 
-def _of_photo(image: Image8, sheet: Sheet | None, which: int | None) -> Reading:
-    """Read the photo of a sketch."""
-    if min(image.colours.shape[:2]) < 64:
+def _of_photo(image: Image8, sheet: Sheet | None, even: bool, which: int | None) -> Reading:
+    """Read the photo of a sketch; on even ground what is found is no sheet."""
+    if min(image.colours.shape[:2]) < LEAST_PHOTO:
         height, width = image.colours.shape[:2]
         raise StackgenError(f"the photo is only {width} x {height} pixels; take a larger one")
     page = read_page(image.colours, sheet)
     found = choose(page.ink, which)
-    if sheet is None and not drawings.is_even(image) and cv2.contourArea(_hull(found.mask)) > 0.55 * found.mask.size:
+    if sheet is None and not even and cv2.contourArea(_hull(found.mask)) > 0.55 * found.mask.size:
         raise StackgenError(_UNCLEAR)
-    if _runs_off(found):
-        raise StackgenError("the drawing runs off the sheet; leave some blank paper around it")
     notes = page.notes
     if sheet is None:
         notes = (*notes, "No sheet's edges are seen, so proportions are uncertain.")
@@ -223,7 +208,7 @@ def _of_photo(image: Image8, sheet: Sheet | None, which: int | None) -> Reading:
     upright = found.mask if sheet is not None else straight_up(found.mask)
     if sheet is not None:
         _polygon(overlay, sheet.corners, _GREEN)
-    return Reading(_figure(upright), "photo", sure, overlay, (*notes, *found.notes))
+    return Reading(_figure(upright, by_hand=True), "photo", sure, overlay, (*notes, *found.notes))
 
 
 def _of_frame(frame: DepthFrame, scale_is_known: bool, cell_size: float | None) -> Reading:
@@ -252,19 +237,28 @@ def _hull(mask: Mask) -> NDArray[np.int32]:
     return np.asarray(cv2.convexHull(np.concatenate(contours)), np.int32)
 
 
-def _runs_off(found: Filled) -> bool:
-    """Tell whether a drawing reaches the edge of what is seen of the sheet."""
-    return touches_edge(found.mask, max(2, round(0.015 * WORK_SIZE)))
-
-
-def _figure(mask: Mask) -> Mask:
-    """Cut a mask (H, W) out to its box, at `FIGURE` pixels."""
+def _figure(mask: Mask, by_hand: bool = False) -> Mask:
+    """Cut a mask (H, W) out to its box, or to that of its sides where it was drawn by hand, at `FIGURE` pixels."""
     cut = mask[bounding_box(mask)]
+    if by_hand:
+        top, right, bottom, left = (_side(np.rot90(cut, turns)) for turns in range(4))
+        cut = cut[top : len(cut) - bottom, left : cut.shape[1] - right]
     scale = FIGURE / max(cut.shape)
     size = (max(1, round(cut.shape[1] * scale)), max(1, round(cut.shape[0] * scale)))
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     figure = cv2.resize(cut.astype(np.float32), size, interpolation=how) >= 0.5
     return np.asarray(figure[bounding_box(figure)])
+
+
+def _side(mask: Mask) -> int:
+    """Return how far (rows) the middle of the uppermost side of a mask (H, W) lies below its highest point.
+
+    A side that was drawn by hand strays, and its highest point would tell the scale of all. A tip has no side.
+    """
+    reach = round(_STRAY * max(mask.shape))
+    tops = np.where(mask.any(axis=0), mask.argmax(axis=0), len(mask))
+    near = tops[tops <= reach]
+    return int(np.median(near)) if len(near) > 4 * reach else 0
 
 
 def _outlined(picture: Picture, mask: Mask, to_picture: NDArray[np.float64]) -> Picture:

@@ -32,11 +32,13 @@ SHEETS = (0.707, 0.773)
 
 _BETWEEN = 0.755  # nearer to Letter, as most sheets are of A4
 
-LEAST_SHEET = 0.12
+LEAST_SHEET = 0.05
 """A sheet is at least this share of the photo."""
 
 SUPPORT = 0.6
 """Least share of each side of a sheet along which it is lighter inside than outside."""
+
+_AT_EDGE = 4.0  # what is nearer to the photo's edge is cut off by it [pixel at which the sheet is looked for]
 
 _SEARCH = 400  # longer edge at which the sheet is looked for [pixel]
 
@@ -48,10 +50,12 @@ class Sheet:
     Args:
         corners: (4, 2) corners [pixel], which may lie outside of the photo.
         sureness: How clear its sides are, 0..1.
+        whole: Whether all four sides are seen; else its length is unknown.
     """
 
     corners: Floats
     sureness: float
+    whole: bool = True
 
     @property
     def slanted(self) -> bool:
@@ -69,17 +73,58 @@ def find_sheet(photo: Picture) -> Sheet | None:
     best: tuple[float, Floats, float] | None = None
     for region in _regions(small):
         corners = _quadrangle(region)
-        if corners is None or _is_frame(corners, region.shape):
+        if corners is None:
+            continue
+        corners = _refined(small, corners, reach=8)
+        if _is_frame(corners, region.shape):
             continue
         sureness, seen = _support(light, tint, corners)
         shape = np.array(small.shape[1::-1])
         area = cv2.contourArea(np.clip(corners, 0, shape).astype(np.float32)) / shape.prod()
-        score = sureness * min(1.0, area / 0.25) ** 0.25 * 0.9 ** (4 - seen)
+        score = sureness * area**0.25 * 0.9 ** (4 - seen)
         if sureness >= SUPPORT and (best is None or score > best[0] + 1e-3):
             best = score, corners, sureness
     if best is None:
         return None
-    return Sheet(_refined(photo, best[1] / factor, reach=3 / factor), best[2])
+    corners = _refined(photo, best[1] / factor, reach=max(2.0, 3 / factor))
+    cut = _cut_side(best[1], small.shape)
+    return Sheet(corners, best[2]) if cut is None else Sheet(_completed(corners, cut, photo.shape), best[2], False)
+
+
+def _cut_side(corners: Floats, shape: tuple[int, ...]) -> int | None:
+    """Return the number of the side that is an edge of the photo rather than of the sheet, None where there is none."""
+    far = np.array(shape[1::-1]) - 1
+    for number in range(4):
+        side = corners[[number, (number + 1) % 4]]
+        if (side.max(axis=0) <= _AT_EDGE).any() or ((far - side).max(axis=0) <= _AT_EDGE).any():
+            return number
+    return None
+
+
+def _completed(corners: Floats, cut: int, shape: tuple[int, ...]) -> Floats:
+    """Put a side (number `cut`) that the photo's edge cuts off square to its neighbours, as it is on the sheet.
+
+    The neighbours are parallel and the opposite side is square to them, which tells the direction of the fourth side
+    where the focal length is known. It passes through the further corner that is seen.
+    """
+    focal, middle = FOCAL * max(shape[:2]), np.array(shape[1::-1]) / 2
+    points = np.column_stack([(np.roll(corners, -cut, axis=0) - middle) / focal, np.ones(4)])
+    here, next_, opposite, last = points  # the side that is cut goes from `here` to `next_`
+    along = np.cross(np.cross(next_, opposite), np.cross(here, last))  # direction of the neighbours
+    across = np.cross(np.cross(opposite, last), along)
+    moved = []
+    for corner in (here, next_):
+        side = np.cross(corner, across)
+        moved.append([np.cross(side, np.cross(*neighbour)) for neighbour in ((here, last), (next_, opposite))])
+    ends = np.array(moved)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ends = (ends[..., :2] / ends[..., 2:]) * focal + middle
+    found = np.roll(corners, -cut, axis=0)
+    outer = max(ends, key=lambda pair: float(((pair - found[[3, 2]]) * (found[:2] - found[[3, 2]])).sum()))
+    if not np.isfinite(outer).all():
+        return corners
+    found[:2] = outer
+    return np.roll(found, cut, axis=0)
 
 
 def _refined(photo: Picture, corners: Floats, reach: float) -> Floats:
@@ -240,14 +285,16 @@ def _support(light: NDArray[np.float32], tint: NDArray[np.float32], corners: Flo
         inward = np.array([-along[1], along[0]])
         inward *= np.sign((middle - start) @ inward)
         points = start + (end - start) * np.linspace(0.04, 0.96, 60)[:, None]
-        inside, outside = (np.round(points + shift * inward).astype(int) for shift in (5, -5))
+        inside, outside, beyond = (np.round(points + shift * inward).astype(int) for shift in (5, -5, -14))
         known = ((inside >= 0) & (outside >= 0) & (inside < [width, height]) & (outside < [width, height])).all(axis=1)
         if np.count_nonzero(known) < 15:
             continue
         (x, y), (u, v) = inside[known].T, outside[known].T
         darker = (light[v, u] + 8) / (light[y, x] + 8)
         duller = tint[v, u] - tint[y, x]
-        least = min(least, float(((darker < 0.88) | (duller < -18)).mean()))
+        far, away = np.clip(beyond[known], 0, [width - 1, height - 1]).T  # beyond a mere line it is light again
+        paper = (light[away, far] > 0.95 * light[y, x]) & (tint[away, far] > tint[y, x] - 9)
+        least = min(least, float((((darker < 0.88) | (duller < -18)) & ~paper).mean()))
         seen += 1
     return (least if seen >= 2 else 0.0), seen
 
@@ -269,13 +316,15 @@ def _usual(ratio: float) -> float:
     return near if ratio < 1 else 1 / near
 
 
-def straightened(photo: Picture, corners: Floats, size: int) -> tuple[Picture, Floats]:
+def straightened(photo: Picture, sheet: Sheet, size: int) -> tuple[Picture, Floats]:
     """Show the sheet straight on.
 
     Returns:
         (h', w', 3) the sheet, `size` pixels for its longer edge, and the (3, 3) homography from photo to sheet.
     """
-    ratio = _usual(sheet_ratio(corners - np.array(photo.shape[1::-1]) / 2, max(photo.shape)))
+    corners = sheet.corners
+    ratio = sheet_ratio(corners - np.array(photo.shape[1::-1]) / 2, max(photo.shape))
+    ratio = _usual(ratio) if sheet.whole else ratio
     width, height = (size, round(size / ratio)) if ratio > 1 else (round(size * ratio), size)
     there = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float32)
     turn = cv2.getPerspectiveTransform(corners.astype(np.float32), there)
@@ -307,74 +356,3 @@ def sheet_ratio(corners: Floats, edge: float) -> float:
     focal = np.sqrt(seen * FOCAL)  # corners tell it badly, and most cameras are alike
     lengths = [np.hypot(np.linalg.norm(vector[:2]) / focal, vector[2]) for vector in (across, down)]
     return float(np.clip(lengths[0] / lengths[1], 0.3, 3.3))
-
-
-def straight_up(mask: Mask) -> Mask:
-    """Turn a drawing (H, W) until its sides are level and upright, as those of blocks are.
-
-    It stands for the sheet where no edges of one are seen: the drawing's own sides tell how the photo was taken.
-    """
-    sides = _sides(mask)
-    level, upright = _turned(sides, upright=False), _turned(sides, upright=True)
-    if level is None or upright is None:
-        return mask
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    left, top, width, height = cv2.boundingRect(np.concatenate(contours))
-    rows = [(np.array([left + width / 2, y]), level[0] + level[1] * y) for y in (top, top + height)]
-    columns = [(np.array([x, top + height / 2]), upright[0] + upright[1] * x) for x in (left, left + width)]
-    lines = [np.array([p, p + [np.cos(a), np.sin(a)]]) for p, a in rows]
-    posts = [np.array([p, p + [-np.sin(a), np.cos(a)]]) for p, a in columns]
-    corners = np.array([_crossing(lines[i], posts[j]) for i, j in ((0, 0), (0, 1), (1, 1), (1, 0))])
-    if not np.isfinite(corners).all():
-        return mask
-    edges = np.linalg.norm(corners - np.roll(corners, -1, axis=0), axis=1)
-    ratio = (edges[0] + edges[2]) / (edges[1] + edges[3])
-    seen = sheet_ratio(corners - np.array(mask.shape[::-1]) / 2, max(mask.shape))
-    ratio = float(np.clip(seen, 0.6 * ratio, 1.7 * ratio))
-    size = max(mask.shape)
-    out = (int(0.8 * size * min(1.0, ratio)), int(0.8 * size * min(1.0, 1 / ratio)))
-    edge = 0.1 * size
-    there = np.array([[0, 0], [out[0], 0], out, [0, out[1]]], np.float32) + np.float32(edge)
-    turn = cv2.getPerspectiveTransform(corners.astype(np.float32), there)
-    canvas = (out[0] + int(2 * edge), out[1] + int(2 * edge))
-    turned = np.asarray(cv2.warpPerspective(mask.astype(np.float32), turn, canvas)) >= 0.5
-    return turned if turned.any() else mask
-
-
-def _sides(mask: Mask) -> Floats:
-    """Return the long straight sides (n, 4) of a drawing: middle x and y, angle [rad], length, of all its borders."""
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    size = max(max(cv2.boundingRect(contour)[2:]) for contour in contours)
-    found = []
-    for contour in contours:
-        points = cv2.approxPolyDP(contour, 0.02 * size, True)[:, 0].astype(np.float64)
-        for start, end in zip(points, np.roll(points, -1, axis=0), strict=True):
-            length = float(np.linalg.norm(end - start))
-            if length > 0.12 * size:
-                angle = float(np.arctan2(*(end - start)[::-1]))
-                found.append([*((start + end) / 2), angle, length])
-    return np.array(found).reshape(-1, 4)
-
-
-def _turned(sides: Floats, upright: bool) -> tuple[float, float] | None:
-    """Fit how far level or upright sides are turned [rad]: at 0, and by pixel across; None where there are none.
-
-    Args:
-        sides: (n, 4) as of `_sides`.
-        upright: Whether upright sides are meant.
-    """
-    if not len(sides):
-        return None
-    angles = (sides[:, 2] - (np.pi / 2 if upright else 0) + np.pi / 2) % np.pi - np.pi / 2
-    near = np.abs(angles) < np.radians(22)
-    if not near.any():
-        return None
-    angles, weights, across = angles[near], sides[near, 3], sides[near, 0 if upright else 1]
-    order = np.argsort(angles)
-    middle = float(angles[order][np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)])
-    alike = np.abs(angles - middle) < np.radians(9)
-    angles, weights, across = angles[alike], weights[alike] ** 2, across[alike]
-    mean, place = float(np.average(angles, weights=weights)), float(np.average(across, weights=weights))
-    spread = float(np.average((across - place) ** 2, weights=weights))
-    slope = float(np.average((angles - mean) * (across - place), weights=weights)) / (spread + 60.0**2)
-    return mean - slope * place, slope

@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from stackgen.vision.sheets import find_sheet, sheet_ratio, straight_up
+from stackgen.vision.photos import straight_up
+from stackgen.vision.sheets import find_sheet, sheet_ratio
 
 CORNERS = np.array([[150, 90], [640, 120], [700, 500], [90, 470]])
 
