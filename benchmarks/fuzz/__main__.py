@@ -61,16 +61,17 @@ def main() -> None:
     options = parser.parse_args()
     prepare()
     worker, counts, defects, begin = Worker(), Counter[tuple[str, str]](), Counter[str](), time.perf_counter()
-    for kind, seed in itertools.islice(turns(options.only, options.seed), options.inputs):
-        outcome, text = worker.give(kind, seed)
-        counts[kind, outcome] += 1
-        if outcome not in ("ok", "refused"):
-            last = text.strip().splitlines()[-2:] if "bug of stackgen" in text else text.strip().splitlines()[-1:]
-            defects[f"{kind}: {' | '.join(last)[:200]}"] += 1
-            print(f"--- {kind} {seed}: {outcome}\n{text[-1200:]}", flush=True)
+    with contextlib.suppress(KeyboardInterrupt):  # what was tried until then is a result, too
+        for kind, seed in itertools.islice(turns(options.only, options.seed), options.inputs):
+            outcome, text = worker.give(kind, seed)
+            counts[kind, outcome] += 1
+            if outcome not in ("ok", "refused"):
+                last = text.strip().splitlines()[-2:] if "bug of stackgen" in text else text.strip().splitlines()[-1:]
+                defects[f"{kind}: {' | '.join(last)[:200]}"] += 1
+                print(f"--- {kind} {seed}: {outcome}\n{text[-1200:]}", flush=True)
     rows = [[kind, *(str(counts[kind, outcome]) for outcome in OUTCOMES)] for kind in options.only]
     metrics = {
-        "inputs": options.inputs,
+        "inputs": counts.total(),
         "seed": options.seed,
         "seconds": round(time.perf_counter() - begin, 1),
         "outcomes": {kind: {o: counts[kind, o] for o in OUTCOMES} for kind in options.only},

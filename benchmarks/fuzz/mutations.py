@@ -228,7 +228,8 @@ def mutated_tar(content: bytes, rng: random.Random) -> bytes:
         elif info.name.endswith(".json"):
             members[at] = info, mutated_json(json.loads(data or b"{}"), rng)
     buffer = io.BytesIO()
-    with tarfile.open(fileobj=buffer, mode=rng.choice(["w"] * 9 + ["w:gz"])) as archive:
+    packed = rng.random() < 0.1
+    with tarfile.open(fileobj=buffer, mode="w:gz" if packed else "w") as archive:
         for info, data in members:
             info.size = len(data) if info.type == tarfile.REGTYPE else 0
             archive.addfile(info, io.BytesIO(data))
@@ -242,7 +243,8 @@ def mutated_checkpoint(content: bytes, rng: random.Random) -> bytes:
     state = torch.load(io.BytesIO(content), weights_only=True)
     if rng.random() < 0.5:
         part = rng.choice([key for key in state if key != "state_dict"])
-        state[part] = mutated_value({part: state[part]}, rng).get(part)
+        changed = mutated_value({part: state[part]}, rng)
+        state[part] = changed.get(part) if isinstance(changed, dict) else changed
     else:
         name = rng.choice(sorted(state["state_dict"]))
         tensor = state["state_dict"].pop(name)

@@ -25,6 +25,7 @@ from stackgen.names import DEFAULT
 from stackgen.robot.planning.build_order import Strategy
 from stackgen.robot.planning.kinematics import SolverName
 from stackgen.robot.workcell import Grasp, Workcell
+from stackgen.sim.statics.fit import describe_misfits
 from stackgen.stack import format_block_list
 from stackgen.vision.options import PictureOptions
 from stackgen.vision.reader import read_picture
@@ -167,7 +168,11 @@ def _from_file(file: Path | None, wanted: Wanted) -> StacksFile:
     content = read_stacks(file)
     if not 1 <= wanted.stack <= len(content.entries):
         raise StackgenError(f"{file}: --stack must lie in 1..{len(content.entries)}, got {wanted.stack}")
-    return replace(content, entries=(content.entries[wanted.stack - 1],))
+    entry = content.entries[wanted.stack - 1]
+    for misfit in describe_misfits(entry.stack):
+        if misfit.impossible:
+            raise StackgenError(f"{file}: stack {wanted.stack} cannot be built: {misfit.text}")
+    return replace(content, entries=(entry,))
 
 
 def _make_folder(out: Path) -> None:

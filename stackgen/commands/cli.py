@@ -18,7 +18,7 @@ import traceback
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple, TextIO
 
-from stackgen.errors import Terminated, printable
+from stackgen.errors import StackgenError, Terminated, printable
 
 BAD_INPUT, BUG, INTERRUPTED, UNREAD, TERMINATED = 2, 70, 130, 141, 143
 
@@ -67,7 +67,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code: 0, what the verb answers (`check`: 1 if a stack falls), 2 for bad input, 130 when interrupted,
         143 when terminated, 141 when nobody reads the output, 70 for a bug of ours (with its traceback).
     """
-    with _standard_streams(), _sigterm_as_an_exception():
+    _mend_streams()
+    with _sigterm_as_an_exception():
         try:
             return _run(list(sys.argv[1:] if argv is None else argv))
         except BrokenPipeError:
@@ -87,6 +88,7 @@ def _run(arguments: list[str]) -> int:
             return _flushed(0)
         if verb not in VERBS:
             return _complain("", _unknown(verb), BAD_INPUT)
+        _check_environment()
         return _flushed(importlib.import_module(VERBS[verb].module).run(verb, rest))
     except SystemExit as exit_:  # argparse's --help and the like
         if _within(exit_, BrokenPipeError):  # rich says 1
@@ -107,6 +109,20 @@ def _run(arguments: list[str]) -> int:
         return _complain(verb, line, BAD_INPUT)
 
 
+_LAUNCHED = (
+    *("RANK", "LOCAL_RANK", "JSM_NAMESPACE_RANK", "WORLD_SIZE", "MASTER_PORT"),
+    *("SLURM_PROCID", "SLURM_LOCALID", "SLURM_NODEID", "SLURM_NTASKS"),
+)
+
+
+def _check_environment() -> None:
+    """See that what launchers leave in the environment are numbers: Lightning reads them while it is imported."""
+    for name in _LAUNCHED:
+        value = os.environ.get(name, "0")
+        if not value.isdecimal():
+            raise StackgenError(f"the environment variable {name} must be a whole number, got {value!r:.60}; unset it")
+
+
 def _within(error: BaseException | None, kind: type[BaseException]) -> bool:
     """Tell whether an error is of a kind, or was raised while one of that kind was answered."""
     while error is not None and not isinstance(error, kind):
@@ -114,16 +130,14 @@ def _within(error: BaseException | None, kind: type[BaseException]) -> bool:
     return error is not None
 
 
-@contextlib.contextmanager
-def _standard_streams() -> Iterator[None]:
+def _mend_streams() -> None:
     """Give a process whose output was closed one that goes nowhere; letters that a terminal lacks come out escaped."""
-    before = sys.stdout, sys.stderr
-    for name, stream in zip(("stdout", "stderr"), before, strict=True):
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
         if stream is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 - for the rest of the process
         elif isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    yield
 
 
 @contextlib.contextmanager
@@ -169,9 +183,7 @@ def explain(error: BaseException) -> str | None:
     if isinstance(error, MemoryError) or "allocate memory" in text:
         return f"there is not enough memory: {text}" if text else "there is not enough memory"
     # By name: the command line does not import the packages that define them.
-    if kinds & {"StackgenError", "ArgumentError", "MisconfigurationException"}:
-        return text
-    if _is_refusal(error):
+    if kinds & {"StackgenError", "ArgumentError", "MisconfigurationException"} or _is_refusal(error):
         return text
     # jsonargparse wraps what goes wrong in a constructor.
     return explain(error.__cause__) if error.__cause__ is not None else None

@@ -31,6 +31,7 @@ from stackgen.commands.hints import did_you_mean
 from stackgen.commands.old_names import renew
 from stackgen.commands.output import FORMS, chosen, telling
 from stackgen.errors import StackgenError
+from stackgen.io.files import is_pipe
 from stackgen.io.text import parse_yaml, read_text, to_yaml
 
 if TYPE_CHECKING:
@@ -313,8 +314,11 @@ def own_sections(verb: str, argv: Sequence[str]) -> list[str]:
     replaced by those they have now. Files come first: what was typed counts, wherever it stands.
 
     Raises:
-        StackgenError: If a file is no YAML in UTF-8, or holds no options.
+        StackgenError: If a file is no YAML in UTF-8, or holds no options, or any argument is a pipe.
     """
+    for value in [part for argument in argv for part in (argument, argument.partition("=")[2])]:
+        if is_pipe(value):
+            raise StackgenError(f"{value} is a pipe or a socket; give a file")
     arguments = [renew(argument) for argument in argv]
     files: list[int] = []
     for index, value in option_values(arguments, CONFIG_FLAGS):

@@ -22,10 +22,14 @@ from stackgen.errors import StackgenError
 def write_atomically(path: str | Path, data: bytes | memoryview) -> None:
     """Write a file whole or not at all: under a temporary name in its folder, made if missing, then in its place.
 
+    What is no file, such as /dev/null, is written to and not replaced.
+
     Raises:
         StackgenError: If the folder cannot be made, is not writable or full; `path` is then as it was before.
     """
     path = Path(path)
+    if path.is_absolute() and path.parts[1] in ("dev", "proc"):
+        return _write_to_device(path, data)
     temporary = path.with_name(f".{path.name[:200]}.{secrets.token_hex(4)}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -40,6 +44,14 @@ def write_atomically(path: str | Path, data: bytes | memoryview) -> None:
             with contextlib.suppress(OSError):
                 temporary.unlink()
             raise
+    except OSError as error:
+        raise StackgenError(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def _write_to_device(path: Path, data: bytes | memoryview) -> None:
+    try:
+        with path.open("wb") as device:
+            device.write(data)
     except OSError as error:
         raise StackgenError(f"{path}: cannot be written: {error.strerror or error}") from error
 
@@ -151,6 +163,15 @@ def read_bytes(path: str | Path) -> bytes:
     """
     with open_bytes(path) as file:
         return file.read()
+
+
+def is_pipe(path: str) -> bool:
+    """Tell whether a path is a pipe or a socket, of which nobody knows when it ends; a shell's own do not count."""
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):  # ValueError: a NUL in the name
+        return False
+    return (stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode)) and not path.startswith(_OWN_PIPES)
 
 
 def require_folder(folder: Path, asked: str) -> None:

@@ -297,3 +297,12 @@ def test_ctrl_c_is_one_line_and_130(tmp_path: Path) -> None:
     assert process.returncode == 130
     assert_one_line(Answer(2, "", err), "interrupted", str(out))
     assert not list(out.glob("*.tmp")) and not (out / "dataset.json").exists()
+
+
+@pytest.mark.parametrize(
+    "words", [["test", "--weights", "PIPE"], ["fit", "--config=PIPE"], ["dataset", "verify", "PIPE"]]
+)
+def test_a_pipe_is_not_waited_for(words: list[str], cli: Cli, tmp_path: Path) -> None:
+    os.mkfifo(pipe := tmp_path / "pipe")
+    answer = cli(*(word.replace("PIPE", str(pipe)) for word in words))
+    assert answer.code == 2 and str(pipe) in answer.line

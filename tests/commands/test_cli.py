@@ -86,6 +86,14 @@ def test_no_text_moves_the_cursor_or_is_too_much_for_a_terminal() -> None:
     assert done.stderr == b"stackgen check: b\\xfccher\\x1b[2J .json: no such file\n"
 
 
+@pytest.mark.parametrize("name", ["LOCAL_RANK", "RANK", "SLURM_PROCID", "WORLD_SIZE"])
+def test_what_a_launcher_left_is_a_number(name: str, cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(name, "text")
+    answer = cli("fit", "--config", "any.yaml")
+    assert answer.code == 2
+    assert answer.line == f"stackgen fit: the environment variable {name} must be a whole number, got 'text'; unset it"
+
+
 def test_sigterm_ends_a_command_with_143(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     before = signal.getsignal(signal.SIGTERM)
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
+import stat
 from pathlib import Path
 
 import pytest
 
 from stackgen.errors import StackgenError
-from stackgen.io.files import require_folder, staged, write_json
+from stackgen.io.files import is_pipe, require_folder, staged, write_json
 
 
 def names(folder: Path) -> list[str]:
@@ -53,3 +55,15 @@ def test_a_file_in_the_place_of_a_folder_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(StackgenError, match=r"--out x: .*file is not a folder"):
         require_folder(tmp_path / "file" / "below", "--out x")
+
+
+def test_a_device_is_written_to_and_not_replaced() -> None:
+    write_json("/dev/null", 1)
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+
+
+def test_pipes_are_told_from_files(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "file").touch()
+    assert is_pipe(str(tmp_path / "pipe"))
+    assert not any(map(is_pipe, (str(tmp_path / "file"), str(tmp_path), "gone", "/dev/stdin", "/dev/null", "a\0b", "")))

@@ -113,10 +113,11 @@ def check_sweep(sweep: Sweep) -> None:
 
 
 def next_trial(study: Study, sweep: Sweep, space: Mapping[str, BaseDistribution]) -> Trial | None:
-    """Start the next trial, an interrupted one first; None if the sweep has all its trials."""
+    """Start the next trial, an interrupted one first; None if the sweep has all its trials or reached its target."""
     trials = trials_of(study)
     if not any(trial.state.name == "WAITING" for trial in trials):
-        if len(trials) >= trials_wanted(sweep):
+        values = [trial.value for trial in trials if trial.state.name == "COMPLETE"]
+        if len(trials) >= trials_wanted(sweep) or any(sweep.metric.is_reached_by(v) for v in values if v is not None):
             return None
         if sweep.method == "grid":
             study.enqueue_trial(grid_point(grid_of(space), len(trials)))
@@ -142,8 +143,8 @@ def follow(study: Study, trial: Trial, child: Child, sweep: Sweep) -> FrozenTria
     if child.told and not math.isfinite(child.told[-1]):
         trial.set_user_attr(DIVERGED, f"{sweep.metric.name} was {child.told[-1]} at report {len(child.told)}")
         return study.tell(trial, state=TrialState.FAIL)
-    if code == 0 and child.told:
-        return study.tell(trial, child.told[-1])
+    if code == 0 and (child.told or sweep.metric.name is None):
+        return study.tell(trial, child.told[-1] if child.told else 0.0)  # Optuna wants a value of whatever ends well
     why = f"exit code {code}: {child.last_words()}" if code else f"it never told {sweep.metric.name}"
     trial.set_user_attr("failure", why)
     return study.tell(trial, state=TrialState.FAIL)
@@ -157,7 +158,7 @@ def line_of(trial: FrozenTrial, sweep: Sweep) -> str:
         return f"trial {trial.number}: failed: {trial.user_attrs['failure']}"
     if trial.state.name == "PRUNED":
         return f"trial {trial.number}: given up after {trial.last_step} reports at {trial.value:.4g}"
-    return f"trial {trial.number}: {sweep.metric.name} {trial.value:.4g}"
+    return f"trial {trial.number}: " + (f"{sweep.metric.name} {trial.value:.4g}" if sweep.metric.name else "done")
 
 
 def trials_of(study: Study) -> list[FrozenTrial]:

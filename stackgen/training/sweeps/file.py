@@ -20,12 +20,24 @@ class Metric:
     """What a sweep optimises.
 
     Args:
-        name: Name of the metric, as the program logs it.
+        name: Name of the metric, as the program logs it; without one, which `bayes` needs, no trial is the best.
         goal: Direction that is better.
+        target: Value of a whole trial after which no other is started.
     """
 
-    name: str
+    name: str | None = None
     goal: Literal["minimize", "maximize"] = "minimize"
+    target: float | None = None
+
+    def is_reached_by(self, value: float) -> bool:
+        """Tell whether a value is as good as the target.
+
+        >>> Metric("loss", target=0.1).is_reached_by(0.2), Metric("iou", "maximize", 0.9).is_reached_by(0.9)
+        (False, True)
+        """
+        if self.target is None:
+            return False
+        return value >= self.target if self.goal == "maximize" else value <= self.target
 
 
 @dataclass(frozen=True)
@@ -79,7 +91,7 @@ class Sweep:
 
     program: str
     parameters: dict[str, dict[str, Any]]
-    metric: Metric
+    metric: Metric = Metric()
     method: Literal["bayes", "random", "grid"] = "bayes"
     command: list[str | int | float | bool] | None = None
     early_terminate: EarlyTerminate | None = None
@@ -92,6 +104,8 @@ class Sweep:
     def __post_init__(self) -> None:
         if self.run_cap is not None and self.run_cap < 1:
             raise StackgenError(f"--run_cap must be at least 1, got {self.run_cap}")
+        if self.metric.name is None and (self.method == "bayes" or self.early_terminate or self.metric.target):
+            raise StackgenError("a sweep that learns from its trials needs a metric, such as {name: validation/loss}")
         stop = self.early_terminate
         if stop is not None and (stop.eta < 2 or stop.first_rung < 1):
             raise StackgenError("early_terminate: eta must be at least 2 and min_iter at least 1")
@@ -100,7 +114,10 @@ class Sweep:
 
     def to_json(self) -> dict[str, Any]:
         """Give the plain form, a W&B sweep file, without what was left out; a parameter's value may be null."""
-        return asdict(self, dict_factory=lambda items: {name: value for name, value in items if value is not None})
+        plain = asdict(self, dict_factory=lambda items: {name: value for name, value in items if value is not None})
+        if self.metric.name is None:
+            del plain["metric"]  # its goal alone says nothing
+        return plain
 
     def to_yaml(self) -> str:
         """Write the file for `wandb sweep`."""

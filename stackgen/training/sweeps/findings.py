@@ -61,7 +61,7 @@ def ranking(study: Study) -> list[FrozenTrial]:
 
 
 def write_findings(study: Study, sweep: Sweep, folder: Path) -> list[Path]:
-    """Write everything that a sweep found, and list the files.
+    """Write everything that a sweep found, and list the files; without a metric that is what became of the trials.
 
     Raises:
         StackgenError: If no trial ran to its end.
@@ -71,6 +71,8 @@ def write_findings(study: Study, sweep: Sweep, folder: Path) -> list[Path]:
     if not values:
         raise StackgenError(f"no trial of {folder} ran to its end; look into {folder}/trials/*/log.txt")
     write_atomically(folder / LEADERBOARD, leaderboard(trials, sweep).encode())
+    if sweep.metric.name is None:
+        return [folder / LEADERBOARD]
     write_atomically(folder / BEST, best_configuration(trials[0], sweep, folder, len(trials)).encode())
     write_slices(trials, sweep, folder / SLICES)
     written = [folder / BEST, folder / LEADERBOARD, folder / SLICES]
@@ -85,7 +87,7 @@ def leaderboard(trials: Sequence[FrozenTrial], sweep: Sweep) -> str:
     names = list(space_of(sweep.parameters))
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(["rank", "trial", "state", sweep.metric.name, "reports", "seconds", *names])
+    table.writerow(["rank", "trial", "state", sweep.metric.name or "-", "reports", "seconds", *names])
     for rank, trial in enumerate(trials, 1):
         seconds = trial.duration.total_seconds() if trial.duration else math.nan
         metrics = [f"{value_of(trial):.6g}", len(trial.intermediate_values), f"{seconds:.1f}"]
@@ -99,7 +101,7 @@ def leaderboard_table(trials: Sequence[FrozenTrial], sweep: Sweep, most: int = 1
     names = list(space_of(sweep.parameters))
     short = [name.rpartition(".")[2] for name in names]
     heads = [s if short.count(s) == 1 else name for s, name in zip(short, names, strict=True)]
-    table = Table("trial", "state", sweep.metric.name, *heads, box=None, pad_edge=False)
+    table = Table("trial", "state", sweep.metric.name or "-", *heads, box=None, pad_edge=False)
     for trial in trials[:most]:
         values = [_shown(trial.params.get(name)) for name in names]
         table.add_row(str(trial.number), state_of(trial), f"{value_of(trial):.4g}", *values)
@@ -148,7 +150,7 @@ def write_importance(study: Study, sweep: Sweep, path: Path) -> None:
 
     pyplot.switch_backend("agg")  # no window, no display
     with pyplot.style.context("default"):  # Optuna sets a style for good
-        axes = plot_param_importances(study, target_name=sweep.metric.name)
+        axes = plot_param_importances(study, target_name=sweep.metric.name or "")
         axes.set_title(f"{sweep.name}: importance of each parameter (PED-ANOVA)", loc="left")
         _save(pyplot.gcf(), path)
         pyplot.close()

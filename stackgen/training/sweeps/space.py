@@ -17,6 +17,8 @@ Parameter = Mapping[str, Any]
 KEYS = {"value", "values", "distribution", "min", "max", "q", "parameters"}
 _PARAMETER_NAME = re.compile(r"\w[\w./-]*")
 KINDS = ("uniform", "int_uniform", "q_uniform", "log_uniform", "log_uniform_values", "q_log_uniform_values")
+_LISTED = ("constant", "categorical")
+"""W&B's words for `value` and `values`, which say it already."""
 
 
 def constants_of(parameters: Mapping[str, Parameter]) -> dict[str, Any]:
@@ -103,6 +105,10 @@ def _check_keys(name: str, given: Any) -> None:
         raise StackgenError(f"parameter {name!r:.60}: a name is made of letters, digits, '_', '-', '.' and '/'")
     if isinstance(given, Mapping) and "probabilities" in given:
         raise StackgenError(f"parameter {name}: only W&B draws by `probabilities`; here all values are equally likely")
+    if isinstance(given, Mapping) and (kind := given.get("distribution", KINDS[0])) not in (*KINDS, *_LISTED):
+        raise StackgenError(
+            f"parameter {name}: distribution {kind!r:.40} is not known here; there are {', '.join(KINDS)}"
+        )
     if not isinstance(given, Mapping) or not given or set(given) - KEYS:
         unknown = ", ".join(sorted(set(map(str, given)) - KEYS)) if isinstance(given, Mapping) else f"{given!r:.60}"
         raise StackgenError(f"parameter {name}: {unknown or 'nothing'} is not understood; there are {sorted(KEYS)}")
@@ -116,8 +122,8 @@ def _distribution(given: Parameter) -> BaseDistribution:
         return distributions.CategoricalDistribution(_choices(given["values"]))
     low, high, q = given.get("min"), given.get("max"), given.get("q", 1)
     kind = given.get("distribution", KINDS[isinstance(low, int) and isinstance(high, int)])
-    if kind not in KINDS:
-        raise ValueError(f"distribution {kind!r:.40} is not one of those that are known here: {', '.join(KINDS)}")
+    if kind in _LISTED:
+        raise ValueError(f"distribution {kind!r} needs value or values")
     if low is None or high is None:
         raise ValueError("give value, values, or min and max")
     if not all(isinstance(number, int | float) and math.isfinite(number) for number in (low, high, q)):

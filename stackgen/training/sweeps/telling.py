@@ -47,7 +47,7 @@ class TellSweep(pl.Callback):
             file.write(json.dumps(content) + "\n")
 
 
-def values_told(path: Path, metric: str) -> list[float]:
+def values_told(path: Path, metric: str | None) -> list[float]:
     """Read one metric's values so far, of the lines that are whole and JSON; NaN for a trial that diverged."""
     found = []
     content = path.read_bytes() if path.exists() else b""

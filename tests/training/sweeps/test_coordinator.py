@@ -96,6 +96,26 @@ def test_a_sweep_ends_with_the_best_configuration_and_pictures(
     assert other.code == 2 and "another metric" in other.line
 
 
+def test_a_grid_without_a_metric_is_run_and_listed(program: Path, cli: Cli, tmp_path: Path) -> None:
+    content = {"program": "program.py", "method": "grid", "parameters": {"x": {"values": [4, 5, 6]}}}
+    (tmp_path / "s.yaml").write_text(yaml.safe_dump(content))
+    answer = cli("sweep", "--config", tmp_path / "s.yaml", "--program", program, "--out", tmp_path / "s")
+    assert answer.code == 0, answer.err
+    rows = list(csv.DictReader((tmp_path / "s" / "leaderboard.csv").open()))
+    assert [(row["state"], row["x"]) for row in rows] == [("complete", "4"), ("complete", "5"), ("complete", "6")]
+    assert not (tmp_path / "s" / "best.yaml").exists()
+    assert "metric" not in yaml.safe_load(cli("sweep", "--config", tmp_path / "s.yaml", "--export_wandb").out)
+    answer = cli("sweep", "--config", tmp_path / "s.yaml", "--method", "bayes", "--out", tmp_path / "t")
+    assert answer.code == 2 and "needs a metric" in answer.line and not (tmp_path / "t").exists()
+
+
+def test_no_trial_starts_once_the_target_is_reached(program: Path, tmp_path: Path) -> None:
+    parameters = {"x": {"values": [5, 3, 4]}}
+    sweep = sweep_of(program, method="grid", parameters=parameters, metric=Metric("loss", target=1.0))
+    run_sweep(sweep, tmp_path)
+    assert states(tmp_path, sweep) == ["complete", "complete"]
+
+
 def test_a_grid_is_visited_once(program: Path, tmp_path: Path) -> None:
     sweep = sweep_of(program, method="grid", parameters={"x": {"values": [0, 1, 2]}, "z": {"min": 4, "max": 5}})
     study = run_sweep(sweep, tmp_path / "out", parallel=3, tell=lambda line: None)

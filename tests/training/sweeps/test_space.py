@@ -42,8 +42,10 @@ def test_parameters_of_wandb_are_distributions_of_optuna() -> None:
     [
         ({"vales": [1]}, "vales"),
         ({"min": 1}, "give value, values, or min and max"),
-        ({"distribution": "beta", "min": 0, "max": 1}, "'beta' is not one of those that are known here: uniform"),
-        ({"distribution": "normal", "mu": 0, "sigma": 1}, "mu, sigma is not understood"),
+        ({"distribution": "beta", "min": 0, "max": 1}, "'beta' is not known here; there are uniform"),
+        ({"distribution": "normal", "mu": 0, "sigma": 1}, "'normal' is not known here; there are uniform"),
+        ({"distribution": "categorical", "min": 0, "max": 1}, "'categorical' needs value or values"),
+        ({"min": 0, "max": 1, "mu": 0, "sigma": 1}, "mu, sigma is not understood"),
         ({"values": [1, 2], "probabilities": [0.1, 0.9]}, "only W&B draws by `probabilities`"),
         ({"values": []}, "at least one"),
         ({"values": 3}, "must be a list"),
