@@ -39,6 +39,29 @@ def test_a_corner_may_lie_outside_of_the_photo() -> None:
     assert sheet is not None and np.abs(sheet.corners - corners).max() < 12
 
 
+def test_a_side_that_the_photo_cuts_off_is_square_to_its_neighbours() -> None:
+    lean, focal = np.radians(30), 600.0
+    flat = np.array([[-1.4, -1], [1.4, -1], [1.4, 2], [-1.4, 2]])  # its lower side lies beyond the photo's edge
+    turn = np.radians(8)
+    flat = flat @ [[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]
+    seen = focal * np.stack([flat[:, 0], flat[:, 1] * np.cos(lean)], axis=1) / (3.6 - flat[:, 1:] * np.sin(lean))
+    photo = photo_with(seen + [400, 300])
+    sheet = find_sheet(photo)
+    assert sheet is not None and not sheet.whole
+    left, right = (sheet.corners[i] - sheet.corners[j] for i, j in ((3, 0), (2, 1)))
+    expected = seen[3] - seen[0], seen[2] - seen[1]
+    for side, own in zip((left, right), expected, strict=True):
+        assert abs(np.cross(np.append(side, 0), np.append(own, 0))[2]) < 0.03 * np.linalg.norm(side) * np.linalg.norm(
+            own
+        )
+
+
+def test_a_small_sheet_is_found() -> None:
+    corners = (CORNERS - [400, 300]) * 0.35 + [400, 300]
+    sheet = find_sheet(photo_with(corners))
+    assert sheet is not None and np.abs(sheet.corners - corners).max() < 4
+
+
 def test_without_a_sheet_there_is_none() -> None:
     assert find_sheet(np.full((600, 800, 3), 230, dtype=np.uint8)) is None
 
