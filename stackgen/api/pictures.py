@@ -72,9 +72,6 @@ def best(
     asked_cells = Cells.parse(cells)
     if asked_cells == Cells() and reading.cell is not None:
         asked_cells = Cells(max(1, round(len(reading.figure) / reading.cell)))
-    asked_cells = Cells.parse(cells)
-    if asked_cells == Cells() and reading.cell is not None:
-        asked_cells = Cells(max(1, round(len(reading.figure) / reading.cell)))
     on_step()
     found = best_stacks(
         reading,

@@ -100,6 +100,7 @@ COMMAND = Command(
     """,
     files=Files("images", "IMAGE", "Pictures of structures: PNG or JPEG, any size, colours and polarity.", many=True),
     settings={"picture": PictureOptions},
+    reports=True,
     flags={"one_shot": "Draw single samples of the network, as the paper does."},
 )
 

@@ -13,7 +13,8 @@ from typing import Any
 from rich.progress import Progress
 
 from stackgen.api import Model
-from stackgen.commands.verdict_table import verdict_table
+from stackgen.commands.output import is_quiet, tell, wrote
+from stackgen.commands.verdict_table import verdict_facts, verdict_table
 from stackgen.errors import StackgenError, printable
 from stackgen.io.files import require_folder, staged
 from stackgen.io.stacks_file import StacksFile, write_stacks
@@ -57,7 +58,7 @@ def answer_all(
     sheets: list[Picture] = []
     refused: list[StackgenError] = []
     screen = Screen(stderr=True)
-    with Progress(console=screen, transient=True, disable=not screen.is_terminal) as progress:
+    with Progress(console=screen, transient=True, disable=not screen.is_terminal or is_quiet()) as progress:
         task = progress.add_task("", total=len(images))
         try:
             for image, folder in zip(images, folders, strict=True):
@@ -85,29 +86,36 @@ def answer_all(
 
 
 def report(results: Sequence[StacksFile], out: Path, verified: bool) -> int:
-    """Print what became of the images; the exit code is 1 if a stack falls that was said to be verified."""
-    console = Screen()
-    console.print(verdict_table("image", [(result.silhouette or "", result.entries) for result in results], most=1))
+    """Tell what became of the images; the exit code is 1 if a stack falls that was said to be verified."""
+    tell(verdict_table("image", [(result.silhouette or "", result.entries) for result in results], most=1))
     falls = False
     for result in results if verified else ():
-        console.print(f"{result.silhouette}: {result.comment}", highlight=False, markup=False)
+        tell(f"{result.silhouette}: {result.comment}")
         for number, entry in enumerate(result.entries, 1):
             if entry.verdict is None or not entry.verdict.stable:
                 falls = True
                 why = entry.comment or "the simulator does not agree that it stands"
-                line = f"{result.silhouette}: stack {number} falls: {why}"
-                console.print(line, highlight=False, markup=False, style="red")
+                tell(f"{result.silhouette}: stack {number} falls: {why}", style="red")
     for result in results if verified else ():
         most = max((entry.front_iou or 0.0 for entry in result.entries), default=0.0)
         if most < POOR:
-            console.print(
-                f"{result.silhouette}: the best fit is {most:.2f}; more cells (--cells), other blocks"
-                " in the inventory, or leaving --blocks out could help",
-                highlight=False,
-                markup=False,
-                soft_wrap=True,
+            tell(
+                f"{result.silhouette}: the best fit is {most:.2f}; more cells (--cells), other blocks in the inventory,"
+                " or leaving --blocks out could help"
             )
-    console.print(f"wrote {out}", highlight=False, markup=False)
+    facts = [
+        {
+            "image": result.silhouette,
+            "comment": result.comment,
+            "stacks": [
+                {"blocks": format_block_list(entry.stack.counts, entry.stack.catalogue), **verdict_facts(entry)}
+                for entry in result.entries
+            ],
+        }
+        for result in results
+    ]
+    tell(images=facts)
+    wrote(out)
     return int(falls)
 
 

@@ -157,7 +157,7 @@ def _of_image(image: Image) -> Raster:
         return Levels(np.asarray(image))
     if min(image.size) < SMALLEST:
         raise too_small("it", *image.size)
-    dithered = image.mode == "P" and len(image.getcolors() or ()) > 2
+    dithered = image.mode == "P" and _is_dithered(np.asarray(image))
     if image.mode not in ("L", "RGB") or "transparency" in image.info:
         image = image.convert("RGBA")  # the numbers of a palette cannot be averaged
     if dithered:
@@ -173,6 +173,11 @@ def _of_image(image: Image) -> Raster:
     share = alpha[..., None].astype(np.float32) / 255
     colours = np.round(rgba[..., :3] * share + 255 * (1 - share)).astype(np.uint8)
     return Image8(colours, alpha, factor)
+
+
+def _is_dithered(numbers: NDArray[np.uint8]) -> bool:
+    """Tell whether the colours of a palette (H, W) were mixed from dots rather than drawn in even patches."""
+    return float(np.count_nonzero(numbers[:, 1:] != numbers[:, :-1])) > 0.1 * numbers.size
 
 
 def _of_array(array: NDArray[Any]) -> Raster:

@@ -18,6 +18,7 @@ from stackgen.stack import Stack
 from stackgen.vision import reader
 from stackgen.vision.drawings import grid_offset
 from stackgen.world import PAPER_GRID, Grid, Mask
+from tests.vision.conftest import ROOT
 
 read_silhouette = partial(reader.read_silhouette, grid=PAPER_GRID)
 LARGE = Grid(image_size=480, pixels_per_cell=100, ground_margin=40)
@@ -305,3 +306,12 @@ def test_grid_offset_undoes_a_shift(name: str, shift: int) -> None:
 def test_grid_offset_of_the_mirror_image_is_as_large(name: str) -> None:
     mask = silhouette(stack_of(name), PAPER_GRID)
     assert abs(grid_offset(mask[:, ::-1], PAPER_GRID)) == abs(grid_offset(mask, PAPER_GRID))
+
+
+def test_a_picture_with_a_palette_is_read_as_without(tmp_path: Path) -> None:
+    for name in ("tower", "house"):
+        drawn = Image.open(ROOT / "examples" / "silhouettes" / f"{name}.png").convert("RGB")
+        drawn.quantize(5, dither=Image.Dither.NONE).save(tmp_path / "palette.png")
+        figures = [reader.read_picture(source, PAPER_GRID).figure for source in (drawn, tmp_path / "palette.png")]
+        assert np.abs(np.subtract(figures[0].shape, figures[1].shape)).max() <= 2
+        assert abs(int(figures[0].sum()) - int(figures[1].sum())) < 0.005 * figures[0].sum()
