@@ -163,7 +163,7 @@ def test_a_run_that_was_stopped_goes_on(blow: signal.Signals, cli: Cli, config: 
         assert process.poll() is None
         time.sleep(0.05)
     process.send_signal(blow)
-    _, err = process.communicate(timeout=60)
+    _, err = process.communicate(timeout=300)
     if blow is not signal.SIGKILL:
         code, word = (130, "interrupted") if blow is signal.SIGINT else (143, "terminated")
         assert process.returncode == code
