@@ -223,10 +223,8 @@ def mutated_tar(content: bytes, rng: random.Random) -> bytes:
             info.type, info.linkname = rng.choice([tarfile.SYMTYPE, tarfile.DIRTYPE, tarfile.FIFOTYPE]), "/etc/passwd"
         elif kind == 3:
             members[at] = info, mutated_bytes(data, rng)
-        elif info.name.endswith(".npy"):
-            members[at] = info, _as_npy(mutated_array(np.load(io.BytesIO(data)), rng))
-        elif info.name.endswith(".json"):
-            members[at] = info, mutated_json(json.loads(data or b"{}"), rng)
+        else:
+            members[at] = info, _mutated_member(info.name, data, rng)
     buffer = io.BytesIO()
     packed = rng.random() < 0.1
     with tarfile.open(fileobj=buffer, mode="w:gz" if packed else "w") as archive:
@@ -234,6 +232,16 @@ def mutated_tar(content: bytes, rng: random.Random) -> bytes:
             info.size = len(data) if info.type == tarfile.REGTYPE else 0
             archive.addfile(info, io.BytesIO(data))
     return buffer.getvalue()
+
+
+def _mutated_member(name: str, data: bytes, rng: random.Random) -> bytes:
+    """Change an array or plain data within its format, if it is still of one."""
+    try:
+        if name.endswith(".npy"):
+            return _as_npy(mutated_array(np.load(io.BytesIO(data)), rng))
+        return mutated_json(json.loads(data), rng)
+    except (ValueError, EOFError, UnicodeDecodeError):
+        return mutated_bytes(data, rng)
 
 
 def mutated_checkpoint(content: bytes, rng: random.Random) -> bytes:

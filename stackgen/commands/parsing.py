@@ -359,8 +359,12 @@ def _own_text(value: str, verb: str) -> str | None:
     content = parse_yaml(text, value)
     if not isinstance(content, dict):
         raise StackgenError(f"--config {value}: it holds no options, which are written as `name: value`")
-    if isinstance(content.get(verb), dict):
-        return to_yaml(content[verb])
+    section = content.get(verb)
+    options = section if isinstance(section, dict) else content
+    if options.get("config") is not None:
+        raise StackgenError(f"--config {value}: a file cannot name another one under `config`; give --config twice")
+    if options is section:
+        return to_yaml(section)
     return text if text != written or not text.isascii() else None  # others read files in the encoding of the machine
 
 

@@ -306,3 +306,10 @@ def test_a_pipe_is_not_waited_for(words: list[str], cli: Cli, tmp_path: Path) ->
     os.mkfifo(pipe := tmp_path / "pipe")
     answer = cli(*(word.replace("PIPE", str(pipe)) for word in words))
     assert answer.code == 2 and str(pipe) in answer.line
+
+
+@pytest.mark.parametrize("content", ["config: {a: 1}", "config: other.yaml", "check: {config: {a: 1}}"])
+def test_a_file_of_options_names_no_other(content: str, cli: Cli, tmp_path: Path) -> None:
+    (file := tmp_path / "c.yaml").write_text(content)
+    answer = cli("check", "x.json", "--config", file)
+    assert answer.code == 2 and "a file cannot name another one" in answer.line
