@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import wandb
 import yaml
 
 from stackgen.commands.cli import explain
@@ -95,6 +96,7 @@ def test_every_run_has_a_folder_whatever_a_launcher_left_behind(
 def test_a_wandb_that_refuses_the_key_leaves_the_curves_here(
     cli: Cli, tiny: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    wandb.teardown()  # it keeps what it was told when it was first used in a process
     monkeypatch.setenv("WANDB_API_KEY", "abc")
     monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")
     monkeypatch.delenv("WANDB_MODE", raising=False)
