@@ -195,3 +195,14 @@ def start(main: Callable[[], None]) -> None:
 def _complaint(message: str, code: int) -> int:
     print(message, file=sys.stderr)
     return code
+
+
+def percent(estimate: Mapping[str, float] | None) -> str:
+    """Write a share and its interval in percent, a dash where there is none.
+
+    >>> percent({"value": 0.953, "low": 0.94, "high": 0.97})
+    '95.3 (94-97)'
+    """
+    if estimate is None:
+        return "-"
+    return f"{100 * estimate['value']:.1f} ({100 * estimate['low']:.0f}-{100 * estimate['high']:.0f})"

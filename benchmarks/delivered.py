@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.common import argument_parser, plain_table, report, start
+from benchmarks.common import argument_parser, percent, plain_table, report, start
 from benchmarks.out_of_distribution import DISTURBANCES, scenes_of_kind
 from stackgen.errors import StackgenError
 from stackgen.evaluation.intervals import clustered_ratio
@@ -160,18 +160,12 @@ def table(rows: Sequence[Mapping[str, Any]]) -> Any:
     headings = ("asked", "stacks", "stand", "overlap", "gap", "clean", "same in both")
     lines = [
         [
-            f"{row['set']}, {row['way']}", str(row["stacks"]), _percent(row["stands"]), f"{row['largest_overlap']:.4f}",
-            f"{row['largest_gap']:.4f}", _percent(row["clean"]), _percent(row["same_in_both"]),
+            f"{row['set']}, {row['way']}", str(row["stacks"]), percent(row["stands"]), f"{row['largest_overlap']:.4f}",
+            f"{row['largest_gap']:.4f}", percent(row["clean"]), percent(row["same_in_both"]),
         ]
         for row in rows
     ]  # fmt: skip
     return plain_table("Largest overlap and gap [cell], shares in percent", headings, lines)
-
-
-def _percent(estimate: Mapping[str, float] | None) -> str:
-    if estimate is None:
-        return "-"
-    return f"{100 * estimate['value']:.1f} ({100 * estimate['low']:.0f}-{100 * estimate['high']:.0f})"
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import ndimage
 
-from benchmarks.common import argument_parser, machine, plain_table, report, start
+from benchmarks.common import argument_parser, machine, percent, plain_table, report, start
 from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette
 from stackgen.io.files import write_json
@@ -320,7 +320,7 @@ def main() -> None:
             estimates = {metric: found.estimate(metric) for metric in METRICS}
             row = {"silhouettes": kind, "scenes": len(asked), "method": name, **facts}
             row |= {metric: value and value.to_json() for metric, value in estimates.items()}
-            print(f"{kind}, {name}: " + ", ".join(f"{m} {_percent(row[m])}" for m in METRICS), flush=True)
+            print(f"{kind}, {name}: " + ", ".join(f"{m} {percent(row[m])}" for m in METRICS), flush=True)
             rows.append(row)
             rows.sort(key=lambda row: KINDS.index(row["silhouettes"]))  # stable: methods stay in order
             if options.out is not None:
@@ -353,15 +353,9 @@ def table(rows: Sequence[Mapping[str, Any]], metric: str) -> Any:
     methods = list(dict.fromkeys(row["method"] for row in rows))
     lines: dict[str, list[str]] = {}
     for row in rows:
-        lines.setdefault(f"{row['silhouettes']} ({row['scenes']})", []).append(_percent(row[metric]))
+        lines.setdefault(f"{row['silhouettes']} ({row['scenes']})", []).append(percent(row[metric]))
     title = f"{metric.replace('_', ' ')}, percent"
     return plain_table(title, ("silhouettes (scenes)", *methods), [[name, *line] for name, line in lines.items()])
-
-
-def _percent(estimate: Mapping[str, float] | None) -> str:
-    if estimate is None:
-        return "-"
-    return f"{100 * estimate['value']:.1f} ({100 * estimate['low']:.0f}-{100 * estimate['high']:.0f})"
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.common import argument_parser, plain_table, report, start
+from benchmarks.common import argument_parser, percent, plain_table, report, start
 from stackgen.data.generation.designs import DesignSettings, draw_design, realize
 from stackgen.evaluation.intervals import clustered_ratio
 from stackgen.geometry import silhouette, silhouette_iou
@@ -210,18 +210,12 @@ def table(results: Mapping[str, Sequence[Mapping[str, Any]]], side: str) -> Any:
     headings = ("method", side, "scenes", "answered", "stacks that stand", "best IoU", "seconds", "95th percentile")
     lines = [
         [
-            row["method"], row[side], str(row["scenes"]), _percent(row["answered"]), _percent(row["stands"]),
+            row["method"], row[side], str(row["scenes"]), percent(row["answered"]), percent(row["stands"]),
             f"{100 * row['best_iou']:.1f}", f"{row['seconds']:.2f}", f"{row['seconds_95']:.2f}",
         ]
         for row in rows_of(results, side)
     ]  # fmt: skip
     return plain_table(f"By number of {side}; shares in percent", headings, lines)
-
-
-def _percent(estimate: Mapping[str, float] | None) -> str:
-    if estimate is None:
-        return "-"
-    return f"{100 * estimate['value']:.0f} ({100 * estimate['low']:.0f} to {100 * estimate['high']:.0f})"
 
 
 def draw(results: Mapping[str, Sequence[Mapping[str, Any]]], path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.common import argument_parser, plain_table, report, start
+from benchmarks.common import argument_parser, percent, plain_table, report, start
 from benchmarks.out_of_distribution import KINDS, METRICS, AlignedPredictor, scenes_of_kind
 
 if TYPE_CHECKING:
@@ -69,19 +69,14 @@ def main() -> None:
             estimates = {metric: found.estimate(metric) for metric in METRICS}
             rows.append({"scenes": kind, "number": len(scenes), "method": name}
                         | {metric: value and value.to_json() for metric, value in estimates.items()})  # fmt: skip
-            print(kind, len(scenes), name, *(_percent(rows[-1], metric) for metric in METRICS), flush=True)
+            print(kind, len(scenes), name, *(percent(rows[-1][metric]) for metric in METRICS), flush=True)
     facts = {"samples_per_scene": options.num_samples, "seed": options.seed, "rows": rows}
     lines = [
-        [row["scenes"], str(row["number"]), row["method"], *(_percent(row, metric) for metric in METRICS)]
+        [row["scenes"], str(row["number"]), row["method"], *(percent(row[metric]) for metric in METRICS)]
         for row in rows
     ]
     title = "stability, front IoU and that of the stable, percent"
     report("taught", facts, [plain_table(title, ("scenes", "number", "method", *METRICS), lines)], options.out)
-
-
-def _percent(row: dict[str, Any], metric: str) -> str:
-    value = row[metric]
-    return "-" if value is None else f"{100 * value['value']:.1f} ({100 * value['low']:.0f}-{100 * value['high']:.0f})"
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Configurations that were found beside a checkpoint, not typed: what is taken from them.
 
-A run's folder may come from anybody. So its configuration names no code but stackgen's, no command, no place behind a
-URL and no folder to write to; whoever wants that says it: `--config FILE` reads the same file as the user's own word.
+A run's folder may come from anybody. So its configuration may name stackgen's own code and local data, but no other
+code, no command, no URL and no folder to write to. `--config FILE` trusts the same file, and takes everything in it.
 """
 
 from __future__ import annotations

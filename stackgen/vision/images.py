@@ -14,6 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stackgen.errors import StackgenError
+from stackgen.io.arrays import read_npy
+from stackgen.io.files import read_bytes
 from stackgen.world import Mask
 
 if TYPE_CHECKING:
@@ -135,13 +137,12 @@ def _array_in(path: Path) -> NDArray[Any]:
     """Read a .npy of numbers (H, W)."""
     _require_content(path)
     try:
-        values = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError, MemoryError):
+        values = read_npy(read_bytes(path))
+    except (OSError, ValueError, MemoryError):
         raise StackgenError("cannot be read: it is no array of numbers, or is cut short") from None
-    if not isinstance(values, np.ndarray) or values.ndim != 2 or values.dtype.kind not in "uif" or not values.size:
-        shape = getattr(values, "shape", "")
-        raise StackgenError(f"a depth frame is an array (H, W) of numbers, got {getattr(values, 'dtype', '')} {shape}")
-    return np.asarray(values)
+    if values.ndim != 2 or values.dtype.kind not in "uif" or not values.size:
+        raise StackgenError(f"a depth frame is an array (H, W) of numbers, got {values.dtype} {values.shape}")
+    return values
 
 
 def _upright(image: Image) -> Image:
