@@ -207,8 +207,9 @@ def _from_image(image: Path, file: Path | None, wanted: Wanted, picture: Picture
     assert found.block_list is not None and found.target is not None
     save_image(wanted.out / "silhouette.png", found.target)
     lines = [f"read as a {reading.describe()}", *reading.notes]
-    blocks, best = format_block_list(found.block_list, found.world.catalogue), found.entries[0].front_iou
-    tell(*lines, f"{image.name}: {blocks}; {found.comment}; front IoU {best:.2f}", read_as=reading.describe())
+    blocks, best = format_block_list(found.block_list, found.world.catalogue), found.entries[0]
+    match = f"front IoU {best.front_iou:.2f}, {'matches' if best.matches else 'does not match'}"
+    tell(*lines, f"{image.name}: {blocks}; {found.comment}; {match}", read_as=reading.describe())
     return found
 
 

@@ -53,7 +53,8 @@ def stacks_of_picture(
     if model is None:
         search = within(limit)
         for cells in ("auto", *map(str, SCALES)):
-            found = best(reading, NUMBER, seed, inventory=inventory, cells=cells, search=search, on_step=on_step)
+            found = best(reading, NUMBER, seed, inventory=inventory, cells=cells, search=search)
+            on_step()
             if most is None or any(len(stack) <= most for stack in found.stacks):
                 break
     else:

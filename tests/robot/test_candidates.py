@@ -11,7 +11,7 @@ import pytest
 from stackgen.api import Model
 from stackgen.errors import StackgenError
 from stackgen.robot.build import plan_stack
-from stackgen.robot.candidates import first_buildable, stacks_of_picture
+from stackgen.robot.candidates import NUMBER, first_buildable, stacks_of_picture
 from stackgen.robot.workcell import Staging, Workcell
 from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
@@ -55,3 +55,10 @@ def test_a_picture_of_which_no_stack_stands_is_one_line(towers: Model, monkeypat
     arch = read_picture(ROOT / "examples" / "silhouettes" / "arch.png", PAPER_GRID)
     with pytest.raises(StackgenError, match="none of the stacks that were tried stands; try a larger --budget"):
         stacks_of_picture(arch, "arch.png", towers, budget="3")
+
+
+def test_the_work_proceeds_in_no_more_steps_than_were_told_however_many_scales_are_tried() -> None:
+    steps: list[int] = []
+    wall = read_picture(np.ones((60, 60), bool) & (np.indices((60, 60)).sum(0) > 20), PAPER_GRID)
+    found = stacks_of_picture(wall, "wall.png", most=0, on_step=lambda: steps.append(1))
+    assert len(found.entries) > 0 and len(steps) == NUMBER + 1
