@@ -158,18 +158,22 @@ def report(name: str, metrics: Mapping[str, Any], tables: Sequence[Table], out: 
         style="dim",
         highlight=False,
     )
-    if out is None:
-        return
+    if out is not None:
+        save(name, metrics, out)
+        console.print(f"wrote {out}", highlight=False)
+
+
+def save(name: str, metrics: Mapping[str, Any], out: Path) -> None:
+    """Write metrics as JSON, with the command and the machine that made them."""
     content = {
         "format": FORMAT,
         "benchmark": name,
         "command": " ".join([f"python -m benchmarks.{name}", *sys.argv[1:]]),
-        "machine": facts,
+        "machine": machine(),
         "figures": metrics,  # the key of the files in docs/results
     }
     out.parent.mkdir(parents=True, exist_ok=True)
     write_json(out, content)
-    console.print(f"wrote {out}", highlight=False)
 
 
 def plain_table(title: str, headings: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:

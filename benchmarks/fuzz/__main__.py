@@ -3,7 +3,8 @@
 Each input is run in a process with a limit of time and memory. An input is right or refused in one line; a traceback,
 a hang, the end of the process or a file that is left half written is a defect, and is printed with its seed.
 
-    python -m benchmarks.fuzz --inputs 10000 --seed 0
+    python -m benchmarks.fuzz --inputs 10000 --seed 0 --out a.json     # typed again, it goes on where it was stopped
+    python -m benchmarks.fuzz --add a.json b.json --out sum.json       # runs of several seeds as one
     python -m benchmarks.fuzz --only weights --inputs 1 --seed 1234    # one input again
 """
 
@@ -14,15 +15,16 @@ import io
 import itertools
 import shutil
 import sys
-import time
-from collections import Counter
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
-from benchmarks.common import argument_parser, plain_table, report, start
+from benchmarks.common import argument_parser, plain_table, report, save, start
 from benchmarks.fuzz.kinds import KINDS, SLOW, TOWERS, command_line
+from benchmarks.fuzz.tally import OUTCOMES, Tally, added
 from benchmarks.fuzz.worker import Worker
 
-OUTCOMES = ("ok", "refused", "more lines", "traceback", "hang", "died", "half-written")
+OFTEN = 50
+"""Inputs after which what has been found so far is written."""
 
 
 def prepare() -> None:
@@ -52,33 +54,41 @@ def turns(kinds: Sequence[str], seed: int) -> Iterator[tuple[str, int]]:
                 yield kind, seed + number // 4
 
 
+def run(kinds: Sequence[str], seed: int, inputs: int, out: Path | None) -> Tally:
+    """Try inputs; what was found until an interruption is a result, too."""
+    tally, worker = Tally.begin(out, seed), Worker()
+    first = tally.inputs[str(seed)]
+    with contextlib.suppress(KeyboardInterrupt):
+        for kind, number in itertools.islice(turns(kinds, seed), first, inputs):
+            outcome, text, seconds = worker.give(kind, number)
+            tally.inputs[str(seed)] += 1
+            tally.count(kind, outcome, text, seconds)
+            if outcome not in ("ok", "refused"):
+                print(f"--- {kind} {number}: {outcome}\n{text[-1200:]}", flush=True)
+            if out is not None and tally.inputs.total() % OFTEN == 0:
+                save("fuzz", tally.figures(), out)
+    return tally
+
+
 def main() -> None:
     """Try inputs and print what became of them."""
     parser = argument_parser("fuzz", __doc__)
-    parser.add_argument("--inputs", type=int, default=1000, help="Number of inputs, shared by the kinds.")
-    parser.add_argument("--seed", type=int, default=0, help="Seed of the first input of each kind.")
-    parser.add_argument("--only", nargs="*", choices=KINDS, default=list(KINDS), help="Kinds that are tried.")
+    parser.add_argument("--inputs", type=int, default=1000, help="number of inputs, shared by the kinds")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first input of each kind")
+    parser.add_argument("--only", nargs="*", choices=KINDS, default=list(KINDS), help="kinds that are tried")
+    parser.add_argument("--add", nargs="+", type=Path, metavar="FILE", help="results to add up; nothing is tried")
     options = parser.parse_args()
-    prepare()
-    worker, counts, defects, begin = Worker(), Counter[tuple[str, str]](), Counter[str](), time.perf_counter()
-    with contextlib.suppress(KeyboardInterrupt):  # what was tried until then is a result, too
-        for kind, seed in itertools.islice(turns(options.only, options.seed), options.inputs):
-            outcome, text = worker.give(kind, seed)
-            counts[kind, outcome] += 1
-            if outcome not in ("ok", "refused"):
-                last = text.strip().splitlines()[-2:] if "bug of stackgen" in text else text.strip().splitlines()[-1:]
-                defects[f"{kind}: {' | '.join(last)[:200]}"] += 1
-                print(f"--- {kind} {seed}: {outcome}\n{text[-1200:]}", flush=True)
-    rows = [[kind, *(str(counts[kind, outcome]) for outcome in OUTCOMES)] for kind in options.only]
-    metrics = {
-        "inputs": counts.total(),
-        "seed": options.seed,
-        "seconds": round(time.perf_counter() - begin, 1),
-        "outcomes": {kind: {o: counts[kind, o] for o in OUTCOMES} for kind in options.only},
-        "defects": dict(defects.most_common()),
-    }
-    report("fuzz", metrics, [plain_table("What became of inputs", ["kind", *OUTCOMES], rows)], options.out)
-    for line, times in defects.most_common():
+    if options.add:
+        tally = added([Tally.read(path) for path in options.add])
+    else:
+        prepare()
+        tally = run(options.only, options.seed, options.inputs, options.out)
+    figures = tally.figures()
+    rows = [[kind, *(str(counts[o]) for o in OUTCOMES)] for kind, counts in figures["outcomes"].items()]
+    rows.append(["all", *(str(figures["totals"][o]) for o in OUTCOMES)])
+    title = f"What became of {figures['inputs']} inputs"
+    report("fuzz", figures, [plain_table(title, ["kind", *OUTCOMES], rows)], options.out)
+    for line, times in figures["defects"].items():
         print(f"{times} x {line}")
 
 

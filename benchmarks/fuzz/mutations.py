@@ -167,7 +167,8 @@ def mutated_array(array: NDArray[Any], rng: random.Random) -> NDArray[Any]:
     """Change numbers, shape or kind of an array."""
     kind = rng.randrange(7)
     if kind == 0:
-        return array.astype(rng.choice(["f8", "f4", "i8", "u1", "i1", "?", "U3", "c16", ">f4", "M8[s]"]))
+        other = rng.choice(["f8", "f4", "i8", "u1", "i1", "?", "U3", "c16", ">f4", "M8[s]"])
+        return np.zeros(array.shape, other) if array.dtype.kind == "U" else array.astype(other)  # text is no number
     if kind == 1:
         return array[: rng.randrange(len(array) + 1)] if array.ndim else array
     if kind == 2:

@@ -72,8 +72,8 @@ class Worker:
         there.close()
         self.known = set[str]()
 
-    def give(self, kind: str, seed: int) -> tuple[str, str]:
-        """Try one input."""
+    def give(self, kind: str, seed: int) -> tuple[str, str, float]:
+        """Try one input: what became of it, what was said, and its processor time [s]."""
         self.pipe.send((kind, seed))
         limit = SECONDS + (40.0 if kind not in self.known else 0.0)  # the first of a kind loads torch and the rest
         self.known.add(kind)
@@ -82,12 +82,13 @@ class Worker:
             taken = _processor_time(self.process.pid) - used
             if taken > limit or time.monotonic() - begin > PATIENCE:
                 self._end()
-                return "hang", f"{taken:.0f} s of processor time"
+                return "hang", f"{taken:.0f} s of processor time", taken
         try:
-            return self.pipe.recv()
+            outcome, text = self.pipe.recv()
         except (EOFError, OSError):
             self._end()
-            return "died", "the process ended"
+            outcome, text = "died", "the process ended"
+        return outcome, text, max(_processor_time(self.process.pid) - used, 0.0)
 
     def _end(self) -> None:
         self.process.kill()

@@ -111,9 +111,12 @@ def _row(content: bytes, packed: PackedSample, world: World) -> _Row:
     pixels, silhouette = _npy(content[members["silhouette.npy"]], np.dtype(np.uint8))
     if pixels != (world.grid.image_size, world.grid.image_size // 8):
         raise ValueError(f"a packed silhouette of size {pixels}, not of {world.grid.image_size} pixels square")
-    template = json.loads(content[members["meta.json"]])["template"]
+    meta = json.loads(content[members["meta.json"]])
+    template, layout = meta["template"], meta.get("layout", "")
     if not isinstance(template, int) or not -(2**63) <= template < 2**63:
         raise ValueError(f"template {template!r:.40}")
+    if not isinstance(layout, str):
+        raise ValueError(f"layout {layout!r:.40}")
     return shapes, poses, silhouette, template
 
 
