@@ -7,26 +7,68 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from stackgen.stack import Stack
 from stackgen.world import Grid, Mask, View
 
 Floats = NDArray[np.float64]
 
+# Rotations are written out here, in the arithmetic of scipy.spatial.transform (the tests compare them): importing that
+# costs a second, half of what a cold `stackgen sample` may take.
+_SMALL = 1e-3
+
 _AXES: dict[View, tuple[int, int]] = {"front": (0, 2), "side": (1, 2), "top": (0, 1)}
+
+
+def quaternions(rotation_vectors: ArrayLike) -> Floats:
+    """(..., 3) rotation vectors [rad] to (..., 4) unit quaternions (x, y, z, w)."""
+    vectors = np.asarray(rotation_vectors, dtype=np.float64)
+    angle = np.sqrt((vectors**2).sum(axis=-1, keepdims=True))
+    small = angle <= _SMALL  # where the sine is its series
+    scale = np.where(small, 0.5 - angle**2 / 48 + angle**4 / 3840, np.sin(angle / 2) / np.where(small, 1, angle))
+    return np.concatenate([vectors * scale, np.cos(angle / 2)], axis=-1)
+
+
+def rotation_vectors(quaternions: ArrayLike) -> Floats:
+    """(..., 4) quaternions (x, y, z, w) of any length but 0 to (..., 3) rotation vectors [rad], of angle at most pi."""
+    array = np.asarray(quaternions, dtype=np.float64)
+    unit = array / np.sqrt((array**2).sum(axis=-1, keepdims=True))
+    unit = np.where(unit[..., 3:] < 0, -unit, unit)
+    angle = 2 * np.arctan2(np.sqrt((unit[..., :3] ** 2).sum(axis=-1, keepdims=True)), unit[..., 3:])
+    small = angle <= _SMALL
+    scale = np.where(small, 2 + angle**2 / 12 + 7 * angle**4 / 2880, angle / np.where(small, 1, np.sin(angle / 2)))
+    return scale * unit[..., :3]
 
 
 def rotation_matrices(rotation_vectors: ArrayLike) -> Floats:
     """(..., 3) rotation vectors [rad] to (..., 3, 3) block_to_world rotations."""
-    vectors = np.asarray(rotation_vectors, dtype=np.float64)
-    return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
+    return quaternion_matrices(quaternions(rotation_vectors))
 
 
-def rotation_vectors(matrices: ArrayLike) -> Floats:
-    """(..., 3, 3) rotations to (..., 3) rotation vectors [rad], of angle at most pi."""
-    array = np.asarray(matrices, dtype=np.float64)
-    return Rotation.from_matrix(array.reshape(-1, 3, 3)).as_rotvec().reshape(array.shape[:-1])
+def quaternion_matrices(quaternions: ArrayLike) -> Floats:
+    """(..., 4) unit quaternions (x, y, z, w) to (..., 3, 3) block_to_world rotations."""
+    array = np.asarray(quaternions, dtype=np.float64)
+    products = (array[..., :, None] * array[..., None, :]).reshape(*array.shape[:-1], 16)
+    return (products.take(_PRODUCTS, axis=-1) * _FACTORS).sum(axis=-1).reshape(*array.shape[:-1], 3, 3)
+
+
+_XX, _XY, _XZ, _XW, _, _YY, _YZ, _YW, _, _, _ZZ, _ZW, _, _, _, _WW = range(16)
+_SQUARES = (_XX, _YY, _ZZ, _WW)
+_PRODUCTS = np.array(
+    [
+        *(_SQUARES, (_XY, _ZW, 0, 0), (_XZ, _YW, 0, 0)),
+        *((_XY, _ZW, 0, 0), _SQUARES, (_YZ, _XW, 0, 0)),
+        *((_XZ, _YW, 0, 0), (_YZ, _XW, 0, 0), _SQUARES),
+    ]
+)
+_FACTORS = np.array(
+    [
+        *((1, -1, -1, 1), (2, -2, 0, 0), (2, 2, 0, 0)),
+        *((2, 2, 0, 0), (-1, 1, -1, 1), (2, -2, 0, 0)),
+        *((2, -2, 0, 0), (2, 2, 0, 0), (-1, -1, 1, 1)),
+    ]
+)
+"""Each element of a rotation matrix as the sum of up to four products of a quaternion's parts."""
 
 
 def tilt(poses: ArrayLike) -> Floats:

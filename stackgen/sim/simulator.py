@@ -14,8 +14,8 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from stackgen.geometry import quaternion_matrices, quaternions, rotation_vectors
 from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
 from stackgen.world import Shape
@@ -36,8 +36,8 @@ class Engine(Protocol):
         """
         ...
 
-    def step(self, number: int) -> None:
-        """Let a number of steps pass."""
+    def step(self, number: int, forces: Floats | None = None) -> None:
+        """Let a number of steps pass; forces (k, 3) [N] act on the centres of mass all the while."""
         ...
 
     def states(self) -> Floats:
@@ -99,7 +99,13 @@ class Simulator:
         self._engine: Engine | None = None
 
     def rollout(
-        self, stack: Stack, *, until_fall: bool = False, until_moved: float = np.inf, record_every: int = 0
+        self,
+        stack: Stack,
+        *,
+        until_fall: bool = False,
+        until_moved: float = np.inf,
+        record_every: int = 0,
+        pull: Floats | None = None,
     ) -> Rollout:
         """Spawn a stack at its poses and watch it until it rests or the watch is over.
 
@@ -108,12 +114,13 @@ class Simulator:
             until_fall: End as soon as a block fell: enough for a verdict, and much faster.
             until_moved: End as soon as a block moved further than this from its start [cell].
             record_every: Keep every n-th step's poses in the trajectory; 0 keeps none.
+            pull: (k, 3) force on the centre of mass of each block all the while, as a share of its weight.
         """
         if self._engine is None:
             self._engine = open_engine(self._scaled)
         order = np.lexsort((*stack.poses.T, stack.shapes))  # the order of the blocks must not matter
         shapes = [stack.catalogue[shape] for shape in stack.shapes[order]]
-        watch = _Watch(self._engine, self._scaled, shapes, stack.poses[order])
+        watch = _Watch(self._engine, self._scaled, shapes, stack.poses[order], None if pull is None else pull[order])
         poses, at_rest, steps, frames = watch.run(until_fall, until_moved, record_every)
         back = np.argsort(order)
         trajectory = np.array([frame[back] for frame in frames]) if record_every else None
@@ -135,11 +142,15 @@ class Simulator:
 class _Watch:
     """One stack in an engine: metres there, cells here."""
 
-    def __init__(self, engine: Engine, physics: Physics, shapes: Sequence[Shape], poses: Floats) -> None:
+    def __init__(
+        self, engine: Engine, physics: Physics, shapes: Sequence[Shape], poses: Floats, pull: Floats | None
+    ) -> None:
         self.engine, self.physics, self.start = engine, physics, poses
+        weights = np.array([shape.volume for shape in shapes]) * physics.density * physics.cell_size**3 * physics.gravity
+        self.forces = None if pull is None else pull * weights[:, None]
         self.com = np.array([shape.center_of_mass for shape in shapes]).reshape(-1, 3)  # in the block frame [cell]
-        rotation = Rotation.from_rotvec(poses[:, 3:])
-        engine.put(shapes, (poses[:, :3] + rotation.apply(self.com)) * physics.cell_size, rotation.as_quat())
+        turned = quaternions(poses[:, 3:])
+        engine.put(shapes, (poses[:, :3] + self._arms(turned)) * physics.cell_size, turned)
 
     def run(self, until_fall: bool, until_moved: float, record_every: int) -> tuple[Floats, bool, int, list[Floats]]:
         """Let time pass; return the final poses (k, 6), whether all rests, the steps taken and the recorded frames."""
@@ -176,7 +187,7 @@ class _Watch:
         step, last = 0, max(1, round(self.physics.watch / self.physics.step))
         while step < last:
             stop = min(last, *((step // every + 1) * every for every in (look, record_every) if every))
-            self.engine.step(stop - step)
+            self.engine.step(stop - step, self.forces)
             yield (step := stop)
 
     def _states(self) -> Floats:
@@ -185,5 +196,10 @@ class _Watch:
 
     def _poses(self, states: Floats) -> Floats:
         """Convert states (k, 7) to poses (k, 6) of the block frames [cell, rad]."""
-        rotation = Rotation.from_quat(states[:, 3:])
-        return np.concatenate([states[:, :3] - rotation.apply(self.com), rotation.as_rotvec()], axis=1)
+        turned = states[:, 3:]
+        unit = turned / np.sqrt((turned**2).sum(axis=1, keepdims=True))
+        return np.concatenate([states[:, :3] - self._arms(unit), rotation_vectors(turned)], axis=1)
+
+    def _arms(self, turned: Floats) -> Floats:
+        """Give the ways (k, 3) from the blocks' references to their centres of mass, turned by quaternions [cell]."""
+        return np.einsum("kij,kj->ki", quaternion_matrices(turned), self.com)

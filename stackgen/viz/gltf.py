@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from stackgen.geometry import quaternions
 from stackgen.io.files import write_atomically
 from stackgen.stack import Stack
 from stackgen.viz.render import Colour, shape_colour
@@ -54,7 +54,7 @@ def glb_bytes(stack: Stack, cell_size: float = 0.05) -> bytes:
         primitive = {"attributes": attributes, "indices": buffer.add(triangles.ravel(), "SCALAR"), "material": material}
         meshes.append({"name": shape.name, "primitives": [primitive]})
         materials.append(_material(shape.name, shape_colour(index)))
-    quaternions = Rotation.from_rotvec(_y_up(stack.poses[:, 3:])).as_quat()
+    rotations = quaternions(_y_up(stack.poses[:, 3:]))
     nodes: list[dict[str, Any]] = [
         {
             "name": f"{number} {name}",
@@ -63,7 +63,7 @@ def glb_bytes(stack: Stack, cell_size: float = 0.05) -> bytes:
             "rotation": quaternion.tolist(),
         }
         for number, (name, shape, pose, quaternion) in enumerate(
-            zip(stack.names, stack.shapes, stack.poses, quaternions, strict=True)
+            zip(stack.names, stack.shapes, stack.poses, rotations, strict=True)
         )
     ]
     nodes.append({"name": "stack", "children": list(range(len(stack)))})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import nnls
 
 from stackgen.search.balance import Balance, steadied
 from stackgen.search.rows import Levels, Placed
@@ -23,11 +24,8 @@ def stack_of(blocks: list[Placed]) -> Stack:
     return Stack(np.array([block.shape for block in blocks]), poses)
 
 
-@given(st.integers(0, 2**32 - 1))
-@settings(max_examples=80, deadline=None)
-def test_what_balances_stands_and_what_nothing_could_hold_does_not(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    blocks = []
+def random_blocks(rng: np.random.Generator) -> list[Placed]:
+    blocks: list[Placed] = []
     for level in range(int(rng.integers(1, 5))):
         left = int(rng.integers(0, 20))
         for _ in range(int(rng.integers(1, 3))):
@@ -35,6 +33,27 @@ def test_what_balances_stands_and_what_nothing_could_hold_does_not(seed: int) ->
             if left + LEVELS.pieces[shape].width <= 64:
                 blocks.append(Placed(shape, left, level))
             left += LEVELS.pieces[shape].width + int(rng.integers(0, 14))
+    return blocks
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 0.025, -0.1, 0.3]), st.booleans())
+@settings(max_examples=150, deadline=None)
+def test_blocks_hold_if_and_only_if_there_are_forces(seed: int, slope: float, any_load: bool) -> None:
+    blocks = random_blocks(np.random.default_rng(seed))
+    balance = Balance(blocks, LEVELS)
+    loaded = [i for i, block in enumerate(blocks) if LEVELS.pieces[block.shape].head] if any_load else []
+    if balance.hangs:
+        assert not balance.holds(slope, loaded)
+        return
+    missing = nnls(balance._effects(slope, loaded), balance._needed)[1]  # another way to look for the same forces
+    if not 1e-8 < missing < 1e-3:  # else rounding decides
+        assert balance.holds(slope, loaded) == (missing < 1e-6)
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=80, deadline=None)
+def test_what_balances_stands_and_what_nothing_could_hold_does_not(seed: int) -> None:
+    blocks = random_blocks(np.random.default_rng(seed))
     outcome = PlaneStatics(stack_of(blocks), 0.5, StaticsMargins()).outcome(np.arange(len(blocks)))
     balance = Balance(blocks, LEVELS)
     assert not balance.stands or outcome == "stands"

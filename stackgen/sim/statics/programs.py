@@ -20,12 +20,12 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import highspy
 import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.geometry import centers_of_mass
 from stackgen.sim.statics.contacts import GROUND, Contact, Point
+from stackgen.sim.statics.linear import has_solution, linear_program
 from stackgen.stack import Stack
 
 Floats = NDArray[np.float64]
@@ -83,12 +83,12 @@ class Statics:
         forces[bears] = np.linalg.solve(trunk, np.column_stack([self.needed, -pull, -self.transmit[:, ~bears]]))
         forces[~bears, 3:] = np.eye(int(np.count_nonzero(~bears)))
         spare = self.allowed @ forces
-        solver = _solver(spare[:, 1:].T, cost=spare[:, 0], rhs=np.zeros(spare.shape[1] - 1))
+        solver = linear_program(spare[:, 1:].T, cost=spare[:, 0], rhs=np.zeros(spare.shape[1] - 1))
 
         def furthest(direction: Floats) -> tuple[Floats, Floats]:
             for row, value in enumerate((-direction).tolist()):
                 solver.changeRowBounds(row, value, value)
-            if not _solve(solver):
+            if not has_solution(solver):
                 raise _NothingHoldsIt
             found = solver.getSolution()
             return -np.array(found.row_dual[:2]), np.array(found.col_value)
@@ -116,8 +116,8 @@ class Statics:
         matrix[:rows] = np.concatenate([self.transmit, np.eye(rows), -np.eye(rows)], axis=1)
         matrix[rows:, :columns] = self.allowed
         cost = np.r_[np.zeros(columns), np.ones(2 * rows)]
-        solver = _solver(matrix, cost, np.r_[self.needed, np.zeros(limits)], free=columns, inequalities=limits)
-        if not _solve(solver, certain=True):
+        solver = linear_program(matrix, cost, np.r_[self.needed, np.zeros(limits)], free=columns, inequalities=limits)
+        if not has_solution(solver, certain=True):
             raise ArithmeticError("HiGHS found no solution where one is certain")
         return float(solver.getInfo().objective_function_value), _moves(np.array(solver.getSolution().row_dual[:rows]))
 
@@ -243,61 +243,6 @@ def _half_planes(corners: list[Point]) -> list[tuple[float, float, float]]:
         if len(corners) == 2:
             planes.append((along, across, along * ax + across * ay))
     return planes
-
-
-def _solver(matrix: Floats, cost: Floats, rhs: Floats, free: int = 0, inequalities: int = 0) -> highspy.Highs:
-    """Set HiGHS up for the least `cost @ x` where `matrix @ x = rhs` and x >= 0.
-
-    The first `free` unknowns have any sign; the last `inequalities` rows are at least their right-hand side.
-    """
-    rows, n = matrix.shape
-    column, row = np.nonzero(np.abs(matrix.T) > 1e-10)
-    starts = np.searchsorted(column, np.arange(n + 1)).astype(np.int32)
-    lower, upper = np.zeros(n), np.full(n, np.inf)
-    lower[:free] = -np.inf
-    row_upper = rhs.copy()
-    row_upper[rows - inequalities :] = np.inf
-    columnwise, least = int(highspy.MatrixFormat.kColwise), int(highspy.ObjSense.kMinimize)
-    solver = highspy.Highs()
-    for option, choice in _OPTIONS.items():
-        solver.setOptionValue(option, choice)
-    solver.passModel(
-        *(n, rows, len(row), columnwise, least, 0.0, cost, lower, upper, rhs, row_upper),
-        *(starts, row.astype(np.int32), matrix[row, column], np.zeros(n, dtype=np.int32)),
-    )
-    return solver
-
-
-# The programs are small and well scaled, and only the right-hand side changes from one to the next: what
-# helps with large ones would only cost time.
-_OPTIONS: dict[str, bool | int | float | str] = {
-    "output_flag": False,
-    "threads": 1,
-    "solver": "simplex",
-    "presolve": "off",
-    "simplex_scale_strategy": 0,
-    "dual_simplex_cost_perturbation_multiplier": 0.0,
-}
-
-
-def _solve(solver: highspy.Highs, certain: bool = False) -> bool:
-    """Solve, and tell whether there is a solution; where one is `certain`, another answer is not believed at once."""
-    solver.run()
-    if solver.getModelStatus() not in (_ANSWERS[:1] if certain else _ANSWERS):
-        solver.clearSolver()  # rounding got in the way: start afresh, with all that HiGHS has against it
-        for option, choice in _CAREFUL.items():
-            solver.setOptionValue(option, choice)
-        solver.run()
-    return bool(solver.getModelStatus() == _STATUS.kOptimal)
-
-
-_STATUS = highspy.HighsModelStatus
-_ANSWERS = (_STATUS.kOptimal, _STATUS.kInfeasible, _STATUS.kUnbounded, _STATUS.kUnboundedOrInfeasible)
-_CAREFUL: dict[str, bool | int | float | str] = {
-    "presolve": "on",
-    "simplex_scale_strategy": 2,
-    "dual_simplex_cost_perturbation_multiplier": 1.0,
-}
 
 
 def inradius(furthest: Callable[[Floats], tuple[Floats, Floats]], tolerance: float = 5e-4) -> tuple[float, Floats]:
