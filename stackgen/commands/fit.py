@@ -218,7 +218,7 @@ class StackgenCLI(LightningCLI):
         rank_zero_only.rank = trainer.global_rank  # type: ignore[attr-defined]
         if not config.fast_dev_run:
             if trainer.is_global_zero:
-                warn_of_other_physics(f"dataset {self.datamodule.path}", made, Physics.recorded(made).to_json())
+                warn_of_other_physics(f"dataset {self.datamodule.dataset.path}", made, Physics.recorded(made).to_json())
             self.folder = self._open_folder(trainer, "version" if verb == "fit" else verb)
             if own_loggers:
                 trainer.loggers = loggers(self.folder, dashboard, trainer.is_global_zero)

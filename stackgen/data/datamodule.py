@@ -30,11 +30,11 @@ STATISTICS_SHARDS = 8
 
 
 class StackDataModule(pl.LightningDataModule):
-    """Training, validation and test data of one dataset.
+    """Training, validation and test data of one dataset, or of several that are joined.
 
     Args:
         path: Dataset folder or compact `.npz` file; also behind a URL (`s3://`, `https://`, ...) or a command
-            (`pipe:ssh host cat data/{file}`).
+            (`pipe:ssh host cat data/{file}`). Of a list of them, of one world, all samples are seen alike.
         batch_size: Number of samples in a batch, on each process.
         mode: Source of the batches: `cached` holds the splits in memory, `stream` reads shards as it goes, `auto`
             caches what takes no more than `cache_gb`.
@@ -54,7 +54,7 @@ class StackDataModule(pl.LightningDataModule):
 
     def __init__(
         self,
-        path: str | Path,
+        path: str | Path | list[str],
         batch_size: int = 256,
         mode: Literal["auto", "cached", "stream"] = "auto",
         cache_gb: float = 2.0,
@@ -73,18 +73,24 @@ class StackDataModule(pl.LightningDataModule):
             raise StackgenError("data: num_workers and cache_gb must not be negative")
         if mode == "cached" and num_workers:
             raise StackgenError("data: num_workers is for mode stream; cached batches need no worker")
-        self.path, self.test_path = str(path), str(test_path or TESTSET)
+        paths = path if isinstance(path, list) else [path]
+        if not paths:
+            raise StackgenError("data: path must name at least one dataset")
+        self.paths, self.test_path = [str(one) for one in paths], str(test_path or TESTSET)
         self.batch_size, self.eval_batch_size = batch_size, eval_batch_size or batch_size
         self.mode, self.cache_gb, self.num_workers, self.seed = mode, cache_gb, num_workers, seed
         self.bucket_by_blocks, self.mirror, self.samples_per_epoch = bucket_by_blocks, mirror, samples_per_epoch
         self._datasets: dict[str, Dataset] = {}
+        self._joined: Dataset | None = None
         self._training: Epochs | None = None
         self._resume: dict[str, Any] | None = None
 
     @property
     def dataset(self) -> Dataset:
         """The dataset of the training and validation split."""
-        return self._open(self.path)
+        if self._joined is None:
+            self._joined = Dataset.join([self._open(path) for path in self.paths])
+        return self._joined
 
     @property
     def test_dataset(self) -> Dataset:
@@ -113,7 +119,7 @@ class StackDataModule(pl.LightningDataModule):
             parts.append(decoded.stacks)
         arrays = StackArrays.concatenate(parts)
         if not len(arrays):
-            raise StackgenError(f"data: none of {len(parts)} training shards of {self.path} can be read")
+            raise StackgenError(f"data: none of {len(parts)} training shards of {self.dataset.path} can be read")
         return arrays.pose_statistics(self.mirror)
 
     def is_cached(self, split: Split) -> bool:
@@ -133,7 +139,9 @@ class StackDataModule(pl.LightningDataModule):
             raise StackgenError("data: mirror needs shapes whose outlines are symmetric; set mirror to false")
         if stage == "fit":
             if self.mode == "stream" and self.dataset.is_compact:
-                raise StackgenError(f"data: mode stream needs a dataset of shards; {self.path} is no such folder")
+                raise StackgenError(
+                    f"data: mode stream needs a dataset of shards; {self.dataset.path} is no such folder"
+                )
             splits: tuple[Split, ...] = ("train", "validation")
             for split in splits:
                 if self.is_cached(split) and split in self.dataset.splits:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,7 +27,8 @@ class Dataset:
     Args:
         path: Where it lies: a local path, a URL (`https:`, `s3:`, ...) or `pipe:COMMAND`.
         manifest: What it says of itself.
-        is_compact: Whether it is one `.npz` file.
+        is_compact: Whether it, or a part of it, is one `.npz` file.
+        parts: The datasets that it joins, if it does; see :meth:`join`.
 
     >>> Dataset.open(TESTSET).manifest.count("test")
     500
@@ -36,6 +37,7 @@ class Dataset:
     path: str
     manifest: Manifest
     is_compact: bool = False
+    parts: tuple[Dataset, ...] = field(default=(), repr=False)
     _splits: dict[str, StackArrays] = field(default_factory=dict, repr=False, compare=False)
 
     @staticmethod
@@ -55,7 +57,34 @@ class Dataset:
         from stackgen.data.compact import load_npz
 
         splits, manifest = load_npz(where)
-        return Dataset(where, manifest, True, splits)
+        return Dataset(where, manifest, True, _splits=splits)
+
+    @staticmethod
+    def join(datasets: Sequence[Dataset]) -> Dataset:
+        """Take several datasets of one world for one: each split is theirs, one after the other.
+
+        What its manifest says of the making is the first one's, but for the silhouettes: they are drawings if any are.
+
+        Raises:
+            StackgenError: If their worlds differ.
+        """
+        first = datasets[0]
+        if len(datasets) == 1:
+            return first
+        for other in datasets[1:]:
+            if other.world != first.world:
+                raise StackgenError(
+                    f"datasets {first.path} and {other.path} are of different worlds: join those of one"
+                )
+        drawings = {"silhouette": "drawing"} if any(dataset.manifest.of_drawings for dataset in datasets) else {}
+        manifest = replace(
+            first.manifest,
+            name=" + ".join(dataset.manifest.name for dataset in datasets),
+            settings=first.manifest.settings | drawings,
+            shards=tuple(shard for dataset in datasets for shard in dataset.manifest.shards),
+        )
+        path = ", ".join(dataset.path for dataset in datasets)
+        return Dataset(path, manifest, any(dataset.is_compact for dataset in datasets), tuple(datasets))
 
     @property
     def world(self) -> World:
@@ -65,6 +94,8 @@ class Dataset:
     @property
     def splits(self) -> tuple[Split, ...]:
         """Names of the splits it has."""
+        if self.parts:
+            return tuple(split for split in SPLITS if any(split in part.splits for part in self.parts))
         if self.is_compact:
             return tuple(split for split in SPLITS if split in self._splits)
         return tuple(split for split in SPLITS if any(entry["split"] == split for entry in self.manifest.shards))
@@ -75,6 +106,8 @@ class Dataset:
         Raises:
             StackgenError: If it has no shards of that split.
         """
+        if self.parts and split in self.splits:
+            return [shard for part in self.parts if split in part.splits for shard in part.shards(split)]
         found = [Shard(self.path, entry) for entry in self.manifest.shards if entry["split"] == split]
         if not found or self.is_compact:
             fault = "is one compact file, not shards" if self.is_compact else f"has no {split} split"
@@ -87,8 +120,14 @@ class Dataset:
         Raises:
             StackgenError: If it has no such split, or a shard is damaged (the message names it).
         """
+        if name not in self._splits and self.parts and name in self.splits:
+            from stackgen.data.arrays import StackArrays
+
+            self._splits[name] = StackArrays.concatenate(
+                [part.split(name) for part in self.parts if name in part.splits]
+            )
         if name not in self._splits:
-            if self.is_compact:
+            if self.is_compact or self.parts:
                 raise StackgenError(f"dataset {self.path} has no {name} split")
             from stackgen.data.decoding import SkipLog, decode_shards
 

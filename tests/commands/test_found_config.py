@@ -35,6 +35,7 @@ HOSTILE: list[tuple[str, Any]] = [
     ("model.init_args.denoiser", EVIL),
     ("model.init_args.optimizer", {"class_path": EVIL}),
     ("data.path", "pipe:touch pwned"),
+    ("data.path", ["data/paper", "pipe:touch pwned"]),
     ("data.path", "https://host/data"),
     ("data.path", "simplecache::s3://host/data"),
     ("data.test_path", "pipe:touch pwned"),

@@ -51,6 +51,31 @@ def test_samples_carry_their_metadata_in_the_order_of_the_shards(
     assert [shard.name for shard in Dataset.open(dataset).shards("train")] == ["train-000000.tar", "train-000001.tar"]
 
 
+def test_datasets_that_are_joined_hold_all_samples_of_each(dataset: Path, compact: Path, tmp_path: Path) -> None:
+    folder = Dataset.open(dataset)
+    only = replace(folder.manifest, shards=folder.manifest.shards[:2], settings={"silhouette": "drawing"})
+    only.save(tmp_path)
+    for shard in only.shards:
+        (tmp_path / shard["file"]).write_bytes((dataset / shard["file"]).read_bytes())
+    for paths in ([dataset, tmp_path], [tmp_path, dataset], [dataset, compact]):
+        parts = [Dataset.open(path) for path in paths]
+        data = StackDataModule([str(path) for path in paths], batch_size=4)
+        joined = data.dataset
+        assert joined.splits == folder.splits and joined.manifest.of_drawings == (tmp_path in paths)
+        for split in joined.splits:
+            those = [part.split(split) for part in parts if split in part.splits]
+            assert np.array_equal(joined.split(split).poses, np.concatenate([arrays.poses for arrays in those]))
+            assert joined.manifest.count(split) == sum(map(len, those))
+        if compact not in paths:
+            names = [shard.name for part in parts for shard in part.shards("train")]
+            assert [shard.name for shard in joined.shards("train")] == names
+            assert sum(1 for _ in joined.samples("train")) == joined.manifest.count("train")
+    assert Dataset.join([folder]) is folder
+    wide = replace(folder, manifest=replace(folder.manifest, world=replace(folder.world, max_blocks=12)))
+    with pytest.raises(StackgenError, match="of different worlds"):
+        Dataset.join([folder, wide])
+
+
 def test_what_is_not_there_is_one_line(dataset: Path, compact: Path, tmp_path: Path) -> None:
     folder = Dataset.open(dataset)
     only = replace(folder.manifest, shards=folder.manifest.shards[:2])
