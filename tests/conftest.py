@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from importlib.util import find_spec
@@ -73,6 +74,12 @@ def cli(capsys: pytest.CaptureFixture[str]) -> Cli:
         return Answer(code, out, err)
 
     return run
+
+
+def workers_of(session: int) -> list[int]:
+    """Worker processes that live in a session."""
+    answer = subprocess.run(["ps", "-ww", "-s", str(session), "-o", "pid=,args="], capture_output=True, text=True)
+    return [int(line.split()[0]) for line in answer.stdout.splitlines() if "spawn_main" in line]
 
 
 def allow_interrupts() -> None:

@@ -26,12 +26,18 @@ RUNS_WITHOUT = {
         "matplotlib.pyplot",
     ),
     "import stackgen.commands.check": ("lightning", "torch", "webdataset", "wandb", "matplotlib.pyplot"),
-    "from stackgen.data import TESTSET, Dataset; Dataset.open(TESTSET).split('test')": ("lightning", "webdataset"),
+    "from stackgen.data import TESTSET, Dataset; Dataset.open(TESTSET).split('test')": (
+        "lightning",
+        "webdataset",
+        "pybullet",
+    ),
     "import stackgen.data.generation.generate": ("torch", "webdataset"),
     "import stackgen.baselines, stackgen.sampling.methods, stackgen.sampling.verified": ("torch", "torchmetrics"),
-    "import stackgen.commands.fit": ("pybullet",),
-    "import stackgen.models.diffusion.module, stackgen.models.block_list.network, stackgen.evaluation.metrics": (
+    "import stackgen.commands.fit, stackgen.training.callbacks, stackgen.models.diffusion.module\n"
+    "import stackgen.models.block_list.network, stackgen.evaluation.metrics": (
         "pybullet",
+        "mujoco",
+        "stackgen.sim.simulator",
         "wandb",
         "cv2",
     ),

@@ -50,7 +50,7 @@ def cli(*words: object) -> tuple[str, str]:
         return ("traceback" if "Traceback" in text else "ok"), text
     if code != 2 or "Traceback" in text:
         return "traceback", text[-1500:]
-    said = ("stackgen:0: UserWarning", "options of ", "trial ")  # before anything went wrong, or of a trial that did
+    said = ("stackgen:0: UserWarning", "options of ")  # before anything went wrong
     told = [line for line in text.splitlines() if line.strip() and not line.startswith(said)]
     return ("refused" if len(told) == 1 and told[0].isprintable() else "more lines"), text
 

@@ -304,7 +304,7 @@ def stranger(folder: Path, rng: random.Random) -> Path:
         ROOT / "LICENSE", ROOT / "docs" / "demo.png", BEFORE / "towers.npz", BEFORE / "expected.json",
         BEFORE / "ddpm" / "version_0" / "config.yaml", BEFORE / "blocklist" / "version_0" / "checkpoints" / "last.ckpt",
         ROOT / "stackgen" / "assets" / "weights" / "blocklist-small.json", towers / "dataset.json",
-        ROOT / "examples" / "extending" / "shape.yaml", ROOT / "configs" / "sweeps" / "ddpm.yaml",
+        ROOT / "examples" / "extending" / "shape.yaml", ROOT / "configs" / "model" / "blocklist-small.yaml",
     ]  # fmt: skip
     kind = rng.randrange(7)
     if kind == 0:

@@ -147,7 +147,9 @@ def test_a_checkpoint_of_another_shape_is_refused_in_one_line(cli: Cli, config: 
     assert "does not fit the model" in answer.err.splitlines()[-1]
 
 
-@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "blow", [*(pytest.param(blow, marks=pytest.mark.slow) for blow in (signal.SIGKILL, signal.SIGINT)), signal.SIGTERM]
+)
 def test_a_run_that_was_stopped_goes_on(blow: signal.Signals, cli: Cli, config: Path) -> None:
     config.write_text(config.read_text().replace("max_epochs: 2", "max_epochs: 100000"))
     process = subprocess.Popen(

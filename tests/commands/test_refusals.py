@@ -93,6 +93,7 @@ def test_every_run_has_a_folder_whatever_a_launcher_left_behind(
         assert (folder / "metrics.csv").stat().st_size and (folder / "checkpoints/last.ckpt").exists()
 
 
+@pytest.mark.slow
 def test_a_wandb_that_refuses_the_key_leaves_the_curves_here(tiny: Path) -> None:
     # A process of its own: wandb keeps what it was told when it was first used in one.
     environment = {**CHILD, "WANDB_API_KEY": "abc", "WANDB_BASE_URL": "http://127.0.0.1:9", "WANDB_MODE": "online"}

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 
 import pytest
 
-from tests.conftest import CHILD, allow_interrupts
+from tests.conftest import CHILD, allow_interrupts, workers_of
 
 PROGRAM = """
 import sys
@@ -55,11 +55,6 @@ def started() -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
-def workers_of(session: int) -> list[int]:
-    answer = subprocess.run(["ps", "-ww", "-s", str(session), "-o", "pid=,args="], capture_output=True, text=True)
-    return [int(line.split()[0]) for line in answer.stdout.splitlines() if "spawn_main" in line]
-
-
 def wait_until_gone(session: int) -> None:
     deadline = time.monotonic() + 60
     while workers_of(session):
@@ -67,7 +62,7 @@ def wait_until_gone(session: int) -> None:
         time.sleep(0.1)
 
 
-@pytest.mark.parametrize("after", ["simulating", "checked"])
+@pytest.mark.parametrize("after", [pytest.param("simulating", marks=pytest.mark.slow), "checked"])
 def test_workers_end_with_a_parent_that_was_killed(after: str) -> None:
     with started() as process:
         assert process.stdout is not None
@@ -79,7 +74,7 @@ def test_workers_end_with_a_parent_that_was_killed(after: str) -> None:
         wait_until_gone(process.pid)
 
 
-@pytest.mark.parametrize("after", ["simulating", "checked"])
+@pytest.mark.parametrize("after", ["simulating", pytest.param("checked", marks=pytest.mark.slow)])
 def test_ctrl_c_for_all_is_answered_by_the_parent_alone(after: str) -> None:
     """Also while the workers are only half there: a terminal sends it to the whole group."""
     with started() as process:

@@ -3,72 +3,41 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
-import signal
+import subprocess
+import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import count, islice
 from pathlib import Path
 
 import pytest
 
-from stackgen.data.generation.executors import ATTEMPTS, Executor, LocalExecutor, RayExecutor, make_executor
+from stackgen.data.generation import executors
+from stackgen.data.generation.executors import Executor, LocalExecutor, RayExecutor, make_executor
 from stackgen.data.generation.generate import generate
 from stackgen.errors import StackgenError
+from tests.conftest import CHILD, workers_of
+from tests.data.generation.dying import Deadly, killed, out_of_memory, refused, slow
 from tests.data.generation.making import SMALL, contents
 
-
-@dataclass(frozen=True)
-class Deadly:
-    """Squares numbers; dies over some of them, so many times.
-
-    Args:
-        folder: Where deaths are counted.
-        deadly: How often each number kills.
-        how: What dying is.
-    """
-
-    folder: Path
-    deadly: dict[int, int]
-    how: Callable[[], None]
-
-    def __call__(self, number: int) -> int:
-        marks = list(self.folder.glob(f"{number}-*"))
-        if len(marks) < self.deadly.get(number, 0):
-            (self.folder / f"{number}-{len(marks)}").touch()
-            self.how()
-        return number**2
+FEWER = 3
+"""Attempts that are allowed here."""
 
 
-def killed() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def out_of_memory() -> None:
-    raise MemoryError
-
-
-def refused() -> None:
-    raise StackgenError("no such thing")
-
-
-def slow(number: int) -> int:
-    time.sleep(0 if number == 0 else 60)
-    return number
+@pytest.fixture(autouse=True)
+def fewer_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each costs a process."""
+    monkeypatch.setattr(executors, "ATTEMPTS", FEWER)
 
 
 def test_every_number_has_its_result_whoever_dies(tmp_path: Path) -> None:
-    task = Deadly(tmp_path, {0: 1, 3: ATTEMPTS - 1, 4: 2}, killed)
+    task = Deadly(tmp_path, {0: 1, 3: FEWER - 1}, killed)
     assert sorted(LocalExecutor(2).map(task, range(6))) == [(n, n**2) for n in range(6)]
-    assert len(list(tmp_path.iterdir())) == 1 + ATTEMPTS - 1 + 2
+    assert len(list(tmp_path.iterdir())) == 1 + FEWER - 1
 
 
 def test_a_number_that_always_kills_ends_the_run_with_a_line(tmp_path: Path) -> None:
     task = Deadly(tmp_path, {2: 1000}, out_of_memory)
-    with pytest.raises(
-        StackgenError, match=rf"{ATTEMPTS} worker processes died over shard 2.*fewer --workers"
-    ) as caught:
+    with pytest.raises(StackgenError, match=rf"{FEWER} worker processes died over shard 2.*fewer --workers") as caught:
         list(LocalExecutor(2).map(task, count()))
     assert "\n" not in str(caught.value) and not multiprocessing.active_children()
 
@@ -87,6 +56,31 @@ def test_who_stops_asking_ends_all_work() -> None:
     assert time.monotonic() - begin < 50 and not multiprocessing.active_children()
 
 
+ENDLESS = """
+from itertools import count
+from stackgen.data.generation.executors import LocalExecutor
+from tests.conftest import CHILD, workers_of
+from tests.data.generation.dying import slow
+if __name__ == "__main__":
+    for number, _ in LocalExecutor(2).map(slow, count()):
+        print(number, flush=True)
+"""
+
+
+def test_workers_end_with_the_process_that_asked(tmp_path: Path) -> None:
+    script = tmp_path / "run.py"
+    script.write_text(ENDLESS)
+    command, session = [sys.executable, str(script)], {"env": CHILD, "start_new_session": True}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, **session) as process:  # type: ignore[call-overload]
+        assert process.stdout.readline() == b"0\n"
+        process.kill()
+        process.wait()
+        deadline = time.monotonic() + 60
+        while workers_of(process.pid):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+
+
 def test_numbers_are_asked_for_only_as_far_as_there_are_workers(tmp_path: Path) -> None:
     asked: list[int] = []
 
@@ -100,10 +94,9 @@ def test_numbers_are_asked_for_only_as_far_as_there_are_workers(tmp_path: Path) 
     results.close()
 
 
-@pytest.mark.parametrize("workers", [1, 3])
-def test_workers_make_what_is_made_without_them(workers: int, small: Path, tmp_path: Path) -> None:
+def test_workers_make_what_is_made_without_them(small: Path, tmp_path: Path) -> None:
     stored: list[int] = []
-    generate(SMALL, tmp_path / "again", workers=workers, progress=stored.append)
+    generate(SMALL, tmp_path / "again", workers=2, progress=stored.append)
     assert contents(tmp_path / "again") == contents(small)
     assert stored == sorted(stored) and stored[-1] == 45 and len(stored) > 2
 

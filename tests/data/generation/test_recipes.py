@@ -61,6 +61,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_any_number_of_workers_makes_the_same_bytes(drawn: Path, tmp_path: Path) -> None:
     generate(DRAWN, tmp_path / "two", executor=make_executor("local", 2))
     assert contents(tmp_path / "two") == contents(drawn)

@@ -24,7 +24,7 @@ from stackgen.data.generation.workshop import MadeShard
 from stackgen.data.manifest import SPLITS
 from stackgen.errors import StackgenError
 from stackgen.io import files
-from tests.conftest import CHILD
+from tests.conftest import CHILD, workers_of
 from tests.data.generation.making import SMALL, Stored, contents, copy, flip
 
 
@@ -198,12 +198,6 @@ def job(out: Path, workers: int, folder: Path) -> Iterator[subprocess.Popen[byte
         process.wait()
 
 
-def workers_of(session: int) -> list[int]:
-    """Worker processes that live in a session."""
-    answer = subprocess.run(["ps", "-ww", "-s", str(session), "-o", "pid=,args="], capture_output=True, text=True)
-    return [int(line.split()[0]) for line in answer.stdout.splitlines() if "spawn_main" in line]
-
-
 def kill(pid: int) -> None:
     with suppress(ProcessLookupError):
         os.kill(pid, signal.SIGKILL)
@@ -216,7 +210,10 @@ def wait_for(process: subprocess.Popen[bytes], out: Path) -> None:
         time.sleep(0.02)
 
 
-def test_a_run_without_its_parent_ends_and_goes_on_to_the_same_bytes(small: Path, tmp_path: Path) -> None:
+@pytest.mark.slow
+def test_a_run_without_its_parent_ends_and_goes_on_to_the_same_bytes(
+    small: Path, shards: dict[int, MadeShard], tmp_path: Path
+) -> None:
     out = tmp_path / "killed"
     with job(out, 2, tmp_path) as process:
         wait_for(process, out)
@@ -227,10 +224,11 @@ def test_a_run_without_its_parent_ends_and_goes_on_to_the_same_bytes(small: Path
         while workers_of(process.pid):  # they end on their own when nobody is left to work for
             assert time.monotonic() < deadline
             time.sleep(0.1)
-    generate(SMALL, out, workers=1)
+    generate(SMALL, out, executor=Stored(shards))
     assert contents(out) == contents(small)
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_with_all_its_workers_goes_on_to_the_same_bytes(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "killed"
     with job(out, 1, tmp_path) as process:
@@ -241,11 +239,13 @@ def test_a_run_that_is_killed_with_all_its_workers_goes_on_to_the_same_bytes(sma
     assert contents(out) == contents(small)
 
 
+@pytest.mark.slow
 def test_a_run_survives_the_death_of_a_worker(small: Path, tmp_path: Path) -> None:
     out = tmp_path / "killed"
     with job(out, 2, tmp_path) as process:
         while len(workers_of(process.pid)) < 2:
             assert process.poll() is None
+            time.sleep(0.1)
         kill(workers_of(process.pid)[0])
         assert process.wait() == 0
     assert contents(out) == contents(small)
