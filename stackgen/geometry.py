@@ -144,6 +144,10 @@ def iou(a: Mask, b: Mask) -> float:
 
 def silhouette_iou(stack: Stack, target: Mask, grid: Grid, view: View = "front") -> float:
     """IoU of a stack's silhouette with a target (H, W); what is off the canvas counts as outside the target."""
+    wide, low = grid.image_size / 2 / grid.pixels_per_cell, -grid.ground_margin / grid.pixels_per_cell
+    corners = np.concatenate([np.empty((0, 3)), *block_vertices(stack)])
+    if (np.abs(corners[:, :2]) < wide).all() and (low < corners[:, 2]).all() and (corners[:, 2] < low + 2 * wide).all():
+        return iou(silhouette(stack, grid, view), np.asarray(target, dtype=bool))
     margin = grid.image_size
     half = (grid.image_size / 2 + margin) / grid.pixels_per_cell - 2
     middle = (grid.image_size / 2 - grid.ground_margin) / grid.pixels_per_cell  # height of the picture's centre

@@ -52,29 +52,37 @@ class Balance:
 
     def __init__(self, blocks: Sequence[Placed], levels: Levels, inset: float = INSET) -> None:
         pieces = [levels.pieces[block.shape] for block in blocks]
-        left = np.array([levels.left_end(block.left) for block in blocks])
-        base = np.array([block.level for block in blocks])
-        top = base + np.array([piece.height for piece in pieces])
-        foot = np.array([piece.foot for piece in pieces], dtype=float) + left[:, None]
-        head = np.array([piece.head or (np.nan, np.nan) for piece in pieces]) + left[:, None]
-        self.weights = np.array([piece.weight for piece in pieces])
-        middle = np.array([piece.middle for piece in pieces])
-        self.centres = np.stack([left + middle[:, 0], base * levels.step + middle[:, 1]], axis=1)
-        self.step, self.top, self.head = levels.step, top, head
-        upper, lower = np.nonzero(base[:, None] == top[None, :])
-        low = np.maximum(foot[upper, 0], head[lower, 0]) + inset
-        high = np.minimum(foot[upper, 1], head[lower, 1]) - inset
-        there = high - low >= -_NEAR  # false for nan: what bears nothing
-        ground = np.flatnonzero(base == 0)
-        self.block = np.concatenate([upper[there], ground])
-        self.by = np.concatenate([lower[there], np.full(len(ground), -1)])
-        self.ends = np.concatenate([np.stack([low, high], axis=1)[there], foot[ground] + np.array([inset, -inset])])
-        self.height = levels.step * base[self.block]
+        lefts = [levels.left_end(block.left) for block in blocks]
+        self.weights = [piece.weight for piece in pieces]
+        self.heights = [block.level * levels.step for block in blocks]  # of the feet
+        self.heads = [
+            (left + piece.head[0], left + piece.head[1], (block.level + piece.height) * levels.step)
+            if piece.head
+            else None
+            for block, piece, left in zip(blocks, pieces, lefts, strict=True)
+        ]
+        self.centres = [
+            (left + piece.middle[0], height + piece.middle[1])
+            for piece, left, height in zip(pieces, lefts, self.heights, strict=True)
+        ]
+        below: dict[int, list[_Support]] = {0: [(-np.inf, np.inf, -1)]}
+        for i, (block, piece, head) in enumerate(zip(blocks, pieces, self.heads, strict=True)):
+            if head:
+                below.setdefault(block.level + piece.height, []).append((head[0], head[1], i))
+        self.supports: list[list[_Support]] = [[] for _ in blocks]
+        for block, piece, left, those in zip(blocks, pieces, lefts, self.supports, strict=True):
+            if piece.foot:
+                first, last = left + piece.foot[0], left + piece.foot[1]
+                for low, high, by in below.get(block.level, ()):
+                    low, high = max(first, low) + inset, min(last, high) - inset
+                    if high - low >= -_NEAR:
+                        those.append((low, high, by))
+        self.upwards = sorted(range(len(blocks)), key=lambda i: blocks[i].level)
 
     @property
     def hangs(self) -> bool:
         """Whether a block has nothing under it."""
-        return len(np.unique(self.block)) < len(self.weights)
+        return not all(self.supports)
 
     def holds(self, slope: float = 0.0, loaded: Sequence[int] = ()) -> bool:
         """Tell whether forces hold all blocks on ground of a slope.
@@ -83,8 +91,8 @@ class Balance:
             slope: Tangent of the tilt, positive to the right.
             loaded: Blocks that any weight may be put on: what cannot be held then will fall whatever comes on top.
         """
-        if not len(self.weights) or self.hangs:
-            return not len(self.weights)
+        if self.hangs:
+            return False
         lack, certain = self._passed_on(slope)
         if not lack or (certain and not loaded):
             return not lack
@@ -102,55 +110,59 @@ class Balance:
             How far loads come to lie from their supports, in all: 0 if forces were found that hold the blocks. And
             whether other forces could do no better.
         """
-        centres = (self.centres[:, 0] + slope * self.centres[:, 1]).tolist()
-        supports: list[list[_Support]] = [[] for _ in centres]
-        ends = (self.ends + slope * self.height[:, None]).tolist()
-        for block, by, (low, high) in zip(self.block.tolist(), self.by.tolist(), ends, strict=True):
-            supports[block].append((low, high, by))
-        upwards = np.argsort(self.centres[:, 1], kind="stable").tolist()
-        firm: list[list[_Support]] = [[] for _ in centres]
-        for i in upwards:
+        centres = [x + slope * z for x, z in self.centres]
+        supports = [
+            [(low + slope * height, high + slope * height, by) for low, high, by in those]
+            for those, height in zip(self.supports, self.heights, strict=True)
+        ]
+        firm: list[_Reach | None] = [None] * len(centres)
+        for i in self.upwards:
             firm[i] = _firm(centres[i], supports[i], firm)
-        force = self.weights.tolist()
+        force = list(self.weights)
         torque = [weight * centre for weight, centre in zip(force, centres, strict=True)]
         shared = [False] * len(centres)  # who bears a part of a load that could be shared out otherwise
         lack, certain = 0.0, False
-        for i in reversed(upwards):
-            place = torque[i] / force[i]
-            parts = firm[i] if _distance(place, firm[i]) <= _CLOSE else supports[i]
-            if (distance := _distance(place, parts)) > _CLOSE:
-                lack += force[i] * distance
-                certain |= not shared[i]
-            for share, at, by in _shares(place, parts, centres):
+        for i in reversed(self.upwards):
+            load, those = force[i], supports[i]
+            place, reach = torque[i] / load, firm[i]
+            if reach is None or not reach[0] - _CLOSE <= place <= reach[1] + _CLOSE:
+                reach = _reach(those)
+                distance = max(reach[0] - place, place - reach[1])
+                if distance > _CLOSE:
+                    lack += load * distance
+                    certain |= not shared[i]
+            for share, at, by in _shares(place, reach, centres):
                 if by >= 0:
-                    force[by] += share * force[i]
-                    torque[by] += share * force[i] * at
-            for _, _, by in supports[i]:
-                shared[by] |= by >= 0 and (shared[i] or len(supports[i]) > 1)
+                    force[by] += share * load
+                    torque[by] += share * load * at
+            if shared[i] or len(those) > 1:
+                for _, _, by in those:
+                    shared[by] |= by >= 0
         return lack, certain or not lack
 
     @property
     def _needed(self) -> Floats:
-        return np.concatenate([self.weights, np.zeros(len(self.weights))])
+        return np.array(self.weights + [0.0] * len(self.weights))
 
     def _effects(self, slope: float, loaded: Sequence[int] = ()) -> Floats:
         """Force and torque (2 k, 2 (c + n)) on the blocks by a unit of force at each end of each contact and load."""
-        k, c, n = len(self.weights), len(self.block), len(loaded)
-        centre = self.centres[:, 0] + slope * self.centres[:, 1]
-        at = self.ends + slope * self.height[:, None]
-        effects = np.zeros((2 * k, 2 * (c + n)))
-        columns = np.arange(c)
-        carried = np.flatnonzero(self.by >= 0)
-        for end in (0, 1):
-            effects[self.block, 2 * columns + end] = 1
-            effects[k + self.block, 2 * columns + end] = at[:, end] - centre[self.block]
-            by = self.by[carried]
-            effects[by, 2 * carried + end] = -1
-            effects[k + by, 2 * carried + end] = -(at[carried, end] - centre[by])
-            for i, block in enumerate(loaded):
-                place = self.head[block, end] + slope * self.step * self.top[block]
-                effects[block, 2 * (c + i) + end] = -1
-                effects[k + block, 2 * (c + i) + end] = -(place - centre[block])
+        k = len(self.weights)
+        centres = [x + slope * z for x, z in self.centres]
+        contacts = [
+            (block, by, end + slope * height)
+            for block, (those, height) in enumerate(zip(self.supports, self.heights, strict=True))
+            for *ends, by in those
+            for end in ends
+        ]
+        for block in loaded:
+            first, last, height = self.heads[block] or (0.0, 0.0, 0.0)
+            contacts += [(-1, block, first + slope * height), (-1, block, last + slope * height)]
+        effects = np.zeros((2 * k, len(contacts)))
+        for column, (block, by, at) in enumerate(contacts):
+            for whom, sign in ((block, 1.0), (by, -1.0)):
+                if whom >= 0:
+                    effects[whom, column] = sign
+                    effects[k + whom, column] = sign * (at - centres[whom])
         return effects
 
     @property
@@ -173,46 +185,55 @@ class Balance:
 _Support = tuple[float, float, int]
 """Both ends of a contact, and the block that bears there or -1 for the ground."""
 
+_Reach = tuple[float, float, Sequence[_Support]]
+"""Some supports, and the two ends between which they bear."""
 
-def _firm(centre: float, supports: Sequence[_Support], firm: Sequence[Sequence[_Support]]) -> list[_Support]:
-    """Find the parts of a block's supports between which it holds whatever comes to lie; none if it is not firm.
+
+def _reach(supports: Sequence[_Support]) -> _Reach:
+    if len(supports) == 1:
+        return (*supports[0][:2], supports)
+    return min(supports)[0], max(high for _, high, _ in supports), supports
+
+
+def _firm(centre: float, supports: Sequence[_Support], firm: Sequence[_Reach | None]) -> _Reach | None:
+    """Find the parts of a block's supports between which it holds whatever comes to lie; None if it is not firm.
 
     Args:
         centre: Where the block's own weight lies.
         supports: What it stands on.
-        firm: The same parts of each block below.
+        firm: The same of each block below.
     """
     parts = []
     for low, high, by in supports:
-        if by >= 0:  # a block that is not firm need not bear anything
-            low = max(low, min(firm[by], default=(np.inf,))[0])
-            high = min(high, max((end for _, end, _ in firm[by]), default=-np.inf))
+        if by >= 0:
+            below = firm[by]
+            if below is None:
+                continue  # it need not bear anything
+            low, high = max(low, below[0]), min(high, below[1])
         if low <= high:
             parts.append((low, high, by))
-    return parts if _distance(centre, parts) <= _CLOSE else []
+    if not parts:
+        return None
+    reach = _reach(parts)
+    return reach if reach[0] - _CLOSE <= centre <= reach[1] + _CLOSE else None
 
 
-def _distance(place: float, supports: Sequence[_Support]) -> float:
-    """Measure how far a place is from lying between supports; without any it is infinitely far."""
-    low, high = min(supports, default=(np.inf, 0.0, 0))[0], max((high for _, high, _ in supports), default=-np.inf)
-    return max(low - place, place - high, 0.0)
-
-
-def _shares(place: float, supports: Sequence[_Support], centres: Sequence[float]) -> list[tuple[float, float, int]]:
-    """Share a load out to the nearest supports on both sides, by the lever's law, as near to their centres as they bear.
+def _shares(place: float, reach: _Reach, centres: Sequence[float]) -> list[tuple[float, float, int]]:
+    """Share a load out to the nearest supports on both sides by the lever's law, as near to their centres as they bear.
 
     Returns:
         For each that bears, its share, where it bears, and which it is. A place beyond all supports counts as the end.
     """
+    first, last, supports = reach
+    if len(supports) == 1:
+        return [(1.0, min(max(place, first), last), supports[0][2])]
     points = sorted((min(max(centres[by], low), high) if by >= 0 else low, by) for low, high, by in supports)
     left = max((point for point in points if point[0] <= place), default=None)
     right = min((point for point in points if point[0] >= place), default=None)
     if left is None:
-        low, _, by = min(supports)
-        return [(1.0, max(place, low), by)]
+        return [(1.0, max(place, first), min(supports)[2])]
     if right is None:
-        _, high, by = max(supports, key=lambda support: support[1])
-        return [(1.0, min(place, high), by)]
+        return [(1.0, min(place, last), max(supports, key=lambda support: support[1])[2])]
     share = (place - left[0]) / (right[0] - left[0]) if left[0] < right[0] else 0.0
     return [(1 - share, *left), (share, *right)]
 
