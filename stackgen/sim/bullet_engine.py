@@ -90,9 +90,15 @@ class BulletEngine:
             self.molds[shape] = Mold.cast(shape, self.physics, self.number)
         return self.molds[shape]
 
-    def step(self, number: int) -> None:
-        """Let a number of steps pass."""
+    def step(self, number: int, forces: Floats | None = None) -> None:
+        """Let a number of steps pass, under forces (k, 3) [N] on the centres of mass."""
+        pulled = (
+            [] if forces is None else [pair for pair in zip(self.bodies, forces.tolist(), strict=True) if any(pair[1])]
+        )
         for _ in range(number):
+            for body, force in pulled:  # Bullet forgets them with each step
+                center, _turn = bullet.getBasePositionAndOrientation(body, physicsClientId=self.number)
+                bullet.applyExternalForce(body, -1, force, center, bullet.WORLD_FRAME, physicsClientId=self.number)
             bullet.stepSimulation(physicsClientId=self.number)
 
     def states(self) -> Floats:

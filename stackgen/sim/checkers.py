@@ -40,6 +40,12 @@ def fell(rollout: Rollout, physics: Physics) -> NDArray[np.bool_]:
     return rollout.drop > physics.fall_height
 
 
+def judged(rollout: Rollout, physics: Physics) -> Verdict:
+    """Give the verdict that follows from a rollout."""
+    fallen = fell(rollout, physics)
+    return Verdict(not fallen.any(), fallen, rollout.drop, rollout.end, rollout.at_rest)
+
+
 class SimulatorChecker:
     """A StabilityChecker that asks an engine, Bullet or MuJoCo.
 
@@ -60,9 +66,7 @@ class SimulatorChecker:
 
     def check(self, stack: Stack) -> Verdict:
         """Give the verdict on one stack."""
-        rollout = self.simulator.rollout(stack, until_fall=self.until_fall)
-        fallen = fell(rollout, self.physics)
-        return Verdict(not fallen.any(), fallen, rollout.drop, rollout.end, rollout.at_rest)
+        return judged(self.simulator.rollout(stack, until_fall=self.until_fall), self.physics)
 
     def check_all(self, stacks: Iterable[Stack]) -> list[Verdict]:
         """Give the verdicts on many stacks, in order."""

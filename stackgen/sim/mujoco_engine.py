@@ -55,12 +55,14 @@ class MujocoEngine:
         mujoco.mj_resetData(self.model, self.data)
         self.data.qpos[:] = np.concatenate([positions, quaternions], axis=1)[:, _SCALAR_FIRST].ravel()
 
-    def step(self, number: int) -> None:
-        """Let a number of steps pass.
+    def step(self, number: int, forces: Floats | None = None) -> None:
+        """Let a number of steps pass, under forces (k, 3) [N] on the centres of mass.
 
         Raises:
             StackgenError: If MuJoCo gave up: it lacked room for contacts, or a motion grew without bound.
         """
+        if forces is not None:
+            self.data.xfrc_applied[1:, :3] = forces
         mujoco.mj_step(self.model, self.data, number)
         if self.data.warning.number.any():
             raise StackgenError(

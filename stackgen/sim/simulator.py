@@ -146,7 +146,9 @@ class _Watch:
         self, engine: Engine, physics: Physics, shapes: Sequence[Shape], poses: Floats, pull: Floats | None
     ) -> None:
         self.engine, self.physics, self.start = engine, physics, poses
-        weights = np.array([shape.volume for shape in shapes]) * physics.density * physics.cell_size**3 * physics.gravity
+        weights = (
+            np.array([shape.volume for shape in shapes]) * physics.density * physics.cell_size**3 * physics.gravity
+        )
         self.forces = None if pull is None else pull * weights[:, None]
         self.com = np.array([shape.center_of_mass for shape in shapes]).reshape(-1, 3)  # in the block frame [cell]
         turned = quaternions(poses[:, 3:])
