@@ -18,6 +18,13 @@ RUNS_WITHOUT = {
     "from stackgen.commands.cli import usage; usage()": ("numpy", "torch", "jsonargparse", "rich"),
     "from contextlib import redirect_stdout as to; from io import StringIO; from stackgen.commands.cli import main\n"
     "with to(StringIO()): assert main(['sample', '--help']) == 0": ("numpy", "omegaconf", "rich", "stackgen.api"),
+    "from stackgen.commands.cli import main; from tempfile import mkdtemp\n"
+    "assert main(['sample', 'examples/silhouettes/arch.png', '--quiet', '--out', mkdtemp()]) == 0": (
+        "scipy",
+        "torch",
+        "omegaconf",
+        "matplotlib",
+    ),
     "import stackgen.commands.sample_pictures, stackgen.models.weights": (
         "lightning",
         "pytorch_lightning",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import os
 import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -208,7 +209,7 @@ class Command:
             self.parser().print_help()
             return 0
         asks_help = {"-h", "--help"} & set(argv)
-        parser = self.parser("yaml" if asks_help else None)
+        parser = self.parser("yaml" if asks_help or not _may_interpolate(argv) else None)
         if asks_help:
             self._shorten_help(parser)
         values = parse(parser, self.verb, own_sections(self.verb, argv))
@@ -305,6 +306,15 @@ def blaming_values() -> Iterator[None]:
         if explain(error) is not None:  # a line of its own
             raise
         raise StackgenError(f"the configuration cannot be used: {shorten(str(error))}") from error
+
+
+def _may_interpolate(argv: Sequence[str]) -> bool:
+    """Tell whether `${...}` may stand in options or in a file of options: importing OmegaConf takes a while."""
+    for before, argument in zip(["", *argv], argv, strict=False):
+        value = argument.partition("=")[2] if argument.startswith("-") else argument if before.startswith("-") else ""
+        if "${" in argument or argument.startswith(CONFIG_FLAGS) or os.path.isfile(value):
+            return True
+    return False
 
 
 def own_sections(verb: str, argv: Sequence[str]) -> list[str]:
