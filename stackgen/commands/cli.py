@@ -39,6 +39,7 @@ VERBS: dict[str, Verb] = {
     "sample": Verb("stackgen.commands.sample", "turn silhouettes into stacks that stand"),
     "check": Verb("stackgen.commands.check", "simulate the structures of a file: which stand, which fall"),
     "show": Verb("stackgen.commands.show", "draw the structures of a file, as a picture and in 3-D"),
+    "studio": Verb("stackgen.commands.studio", "draw silhouettes in the browser, and watch them become structures"),
     "capture": Verb(
         "stackgen.commands.capture", "find the silhouette in a drawing, a photo of a sketch or a depth frame"
     ),

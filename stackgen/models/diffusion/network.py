@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -16,6 +17,9 @@ from stackgen.models.diffusion.solvers import Predict, ancestral, multistep
 from stackgen.models.poses import POSE, PoseNetwork, raster_order
 from stackgen.models.transformer import TransformerConfig
 from stackgen.world import World
+
+Watch = Callable[[Tensor], None]
+"""Sees the noisy poses (B, N, 6) [cell, rad] before each step."""
 
 
 @dataclass(frozen=True)
@@ -155,12 +159,15 @@ class PoseDiffusion(PoseNetwork):
         mask: Tensor,
         generator: torch.Generator,
         sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
+        watch: Watch | None = None,
     ) -> Tensor:
-        """See PoseNetwork; `sampler` says how to get from noise to poses."""
+        """See PoseNetwork; `sampler` says how to get from noise to poses, and `watch` sees them on the way."""
         config = self.complete(sampler)
         predict = self._predictor(silhouettes, shapes, mask)
         if config.guidance is not None and config.guidance != 1:
             predict = self._guided(predict, self._predictor(torch.zeros_like(silhouettes), shapes, mask), config)
+        if watch is not None:
+            predict = self._watched(predict, watch)
         noise = torch.randn((*shapes.shape, POSE), generator=generator, device=generator.device).to(shapes.device)
         assert config.steps and config.spacing
         steps = self.schedule.subset(config.steps, config.spacing)
@@ -190,6 +197,13 @@ class PoseDiffusion(PoseNetwork):
             nonlocal last
             last = self._clean(x, t, self.denoiser(x, t, shapes, mask, memory, last))
             return last
+
+        return predict
+
+    def _watched(self, own: Predict, watch: Watch) -> Predict:
+        def predict(x: Tensor, t: Tensor) -> Tensor:
+            watch(x * self.std + self.mean)
+            return own(x, t)
 
         return predict
 

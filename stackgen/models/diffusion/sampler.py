@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from stackgen.models.diffusion.network import DiffusionConfig, PoseDiffusion
+from stackgen.models.diffusion.network import DiffusionConfig, PoseDiffusion, Watch
 from stackgen.models.diffusion.schedules import ScheduleConfig
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.models.sampler import NetworkSampler
@@ -30,6 +30,8 @@ class DiffusionSampler(NetworkSampler):
     """
 
     model: PoseDiffusion
+    watch: Watch | None = None
+    """Sees the poses of all stacks that are denoised together, step by step."""
 
     def __init__(
         self,
@@ -53,7 +55,7 @@ class DiffusionSampler(NetworkSampler):
 
     def draw(self, silhouettes: Tensor, shapes: Tensor, mask: Tensor, generator: torch.Generator) -> Tensor:
         """See NetworkSampler."""
-        return self.model.sample(silhouettes, shapes, mask, generator, self.sampler)
+        return self.model.sample(silhouettes, shapes, mask, generator, self.sampler, self.watch)
 
 
 def make_diffusion(config: dict[str, Any], world: World) -> tuple[nn.Module, Any]:

@@ -1,0 +1,171 @@
+"""The studio's web server: one page, and the endpoints that it and scripts use.
+
+Endpoints only check what they are sent and hand the work to other processes (:mod:`stackgen.studio.workers`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Annotated, Any
+
+from fastapi import Depends, FastAPI, Header, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.middleware import Middleware
+from pydantic import BaseModel
+from starlette.exceptions import HTTPException
+
+from stackgen.errors import printable
+from stackgen.studio.answers import Form, WorkResponse
+from stackgen.studio.guard import Guard, refusal
+from stackgen.studio.methods import methods
+from stackgen.studio.requests import (
+    GenerateRequest,
+    PushRequest,
+    ReadRequest,
+    StackRequest,
+    TiltRequest,
+)
+from stackgen.studio.workers import Workers
+from stackgen.viz.scene import shape_meshes
+from stackgen.world import PAPER_WORLD
+
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
+
+_PAGE = {
+    "": ("index.html", "text/html"),
+    "studio.js": ("studio.js", "text/javascript"),
+    "studio.css": ("studio.css", "text/css"),
+}
+
+
+class Refusal(BaseModel):
+    """What every answer with a status from 400 holds: one sentence."""
+
+    detail: str
+
+
+_REFUSALS: dict[int | str, dict[str, Any]] = {
+    status: {"description": told, "model": Refusal}
+    for status, told in {
+        413: "The body is too large.",
+        422: "The request cannot be answered; a sentence says why.",
+        429: "Too many requests wait.",
+    }.items()
+}
+
+
+def make_app(workers: Workers, hosts: Iterable[str] = LOOPBACK) -> FastAPI:
+    """Make the application.
+
+    Args:
+        workers: Processes that do the work; they are closed with the application.
+        hosts: Names by which it is reached.
+    """
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        workers.open()
+        yield
+        workers.close()
+
+    app = FastAPI(
+        title="stackgen studio",
+        description="Silhouettes to structures of blocks: what the page of `stackgen studio` asks, for scripts.",
+        docs_url=None,
+        redoc_url=None,
+        lifespan=lifespan,
+        middleware=[Middleware(Guard, hosts=tuple(hosts))],
+    )
+    app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(HTTPException, _not_there)
+    _add_page(app)
+    for work in WORK:
+        app.post(f"/api/{work.task}", summary=work.told, response_class=WorkResponse, responses=_REFUSALS)(
+            _endpoint(workers, work)
+        )
+    return app
+
+
+def _add_page(app: FastAPI) -> None:
+    def serve(name: str, media: str) -> Any:
+        return lambda: Response(_asset(name), media_type=media)
+
+    for path, (name, media) in _PAGE.items():
+        app.add_api_route(f"/{path}", serve(name, media), include_in_schema=False)
+
+    @app.get("/api/start")
+    def start() -> dict[str, Any]:
+        """List the methods, and describe the shapes of the blocks."""
+        return {
+            "methods": methods(),
+            "shapes": shape_meshes(PAPER_WORLD.catalogue),
+            "most_blocks": PAPER_WORLD.max_blocks,
+        }
+
+
+@dataclass(frozen=True)
+class Work:
+    """An endpoint that has work done.
+
+    Args:
+        task: Name of the task, and of the endpoint.
+        request: What it is sent.
+        told: What it does, in a sentence.
+        form: Form of the answer.
+    """
+
+    task: str
+    request: type[BaseModel]
+    told: str
+    form: Form = "json"
+
+
+WORK = (
+    Work(
+        "generate", GenerateRequest, "Make stacks for a drawing; the answer has a message a line, as it goes.", "lines"
+    ),
+    Work("read", ReadRequest, "Read a picture, and turn what is in it into a drawing."),
+    Work("check", StackRequest, "Simulate a stack, and say whether it stands and why."),
+    Work("tilt", TiltRequest, "Simulate a stack on a tilted table."),
+    Work("push", PushRequest, "Simulate a stack one block of which is pushed."),
+)
+
+
+def _client(
+    request: Request,
+    name: Annotated[
+        str, Header(alias="X-Client", max_length=40, pattern="^[0-9a-zA-Z-]*$", include_in_schema=False)
+    ] = "",
+) -> str:
+    """Tell the pages and scripts apart that share the processes."""
+    return name or (request.client.host if request.client else "")
+
+
+def _endpoint(workers: Workers, work: Work) -> Callable[..., Awaitable[Response]]:
+    async def answer(body: Any, client: Any) -> Response:
+        return WorkResponse(workers.work(client, work.task, body), work.form)
+
+    answer.__annotations__ = {"body": work.request, "client": Annotated[str, Depends(_client)]}
+    return answer
+
+
+@cache
+def _asset(name: str) -> bytes:
+    return files("stackgen").joinpath("assets/studio", name).read_bytes()
+
+
+async def _invalid(request: Request, error: Exception) -> Response:
+    """Say in one sentence what is wrong with a request, and where."""
+    assert isinstance(error, RequestValidationError)
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"] if part != "body") or "the body"
+    return refusal(422, printable(f"{place}: {first['msg']}")[:300])
+
+
+async def _not_there(request: Request, error: Exception) -> Response:
+    assert isinstance(error, HTTPException)
+    return refusal(error.status_code, printable(str(error.detail)))

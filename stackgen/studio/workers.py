@@ -1,0 +1,207 @@
+"""Processes that do the heavy work, shared fairly: whoever asks takes turns, and what is cancelled is killed at once.
+
+A process is forked from one that has everything imported, so a new one is there in a moment.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import multiprocessing
+import signal
+import traceback
+from collections import OrderedDict, deque
+from collections.abc import AsyncIterator
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Connection
+from typing import Any
+
+from pydantic import BaseModel
+
+from stackgen.errors import StackgenError, printable
+
+MOST_WAITING = 8
+"""Requests of one client that wait, at most."""
+
+MOST_CLIENTS = 64
+"""Clients that wait, at most."""
+
+
+class Busy(StackgenError):
+    """Too many requests wait already."""
+
+
+class Refused(StackgenError):
+    """The work found that the request cannot be answered; the message says why."""
+
+
+class Broken(Exception):
+    """The process that did the work is gone, or has a bug; the message is for the log."""
+
+
+class Workers:
+    """A few processes and the queue before them.
+
+    Args:
+        number: Number of processes.
+    """
+
+    def __init__(self, number: int) -> None:
+        self._context = multiprocessing.get_context("forkserver")
+        self._context.set_forkserver_preload(["stackgen.studio.tasks"])
+        self._waiting: OrderedDict[str, deque[asyncio.Future[_Process]]] = OrderedDict()
+        self._threads = ThreadPoolExecutor(number + 2, "studio")
+        self._number, self._closed = number, False
+        self._idle: deque[_Process] = deque()
+        self._starting: set[asyncio.Task[None]] = set()
+
+    def open(self) -> None:
+        """Start the processes; they take work once they are ready."""
+        for _ in range(self._number):
+            self._add()
+
+    def _add(self) -> None:
+        task = asyncio.create_task(self._begin())
+        self._starting.add(task)
+        task.add_done_callback(self._starting.discard)
+
+    async def _begin(self) -> None:
+        process = _Process(self._context, self._threads)
+        async for _ in process.answer():
+            pass
+        self._give(process)
+
+    async def work(self, client: str, task: str, request: BaseModel) -> AsyncIterator[bytes]:
+        """Do some work, and yield its messages as JSON; when the iterator is closed early, the work is killed.
+
+        Raises:
+            Busy: If too many requests wait.
+            Refused: If the request cannot be answered.
+            Broken: If the process is gone.
+        """
+        process, whole = await self._turn(client), False
+        try:
+            process.send(task, request)
+            async for line in process.answer():
+                yield line
+            whole = True
+        except Refused:
+            whole = True
+            raise
+        finally:
+            if whole:
+                self._give(process)
+            else:
+                process.kill()
+                self._add()
+
+    async def _turn(self, client: str) -> _Process:
+        """Wait for a process: the clients take turns."""
+        if self._idle:
+            return self._idle.popleft()
+        queue = self._waiting.get(client)
+        if len(self._waiting) >= MOST_CLIENTS if queue is None else len(queue) >= MOST_WAITING:
+            raise Busy("too many requests are waiting; let one finish or cancel it, then ask again")
+        future: asyncio.Future[_Process] = asyncio.get_running_loop().create_future()
+        self._waiting.setdefault(client, deque()).append(future)
+        try:
+            return await future
+        except asyncio.CancelledError:
+            if future.done() and not future.cancelled():
+                self._give(future.result())
+            raise
+
+    def _give(self, process: _Process) -> None:
+        """Hand a process to whoever is next, or keep it."""
+        while self._waiting:
+            client, queue = next(iter(self._waiting.items()))
+            future = queue.popleft()
+            del self._waiting[client]  # to the end of the line
+            if queue:
+                self._waiting[client] = queue
+            if not future.cancelled():
+                future.set_result(process)
+                return
+        if self._closed:
+            process.kill()
+        else:
+            self._idle.append(process)
+
+    def close(self) -> None:
+        """End all processes."""
+        self._closed = True
+        for task in self._starting:
+            task.cancel()
+        for process in self._idle:
+            process.kill()
+        self._idle.clear()
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+
+class _Process:
+    """One process, and the pipe to it."""
+
+    def __init__(self, context: Any, threads: ThreadPoolExecutor) -> None:
+        self._pipe, theirs = context.Pipe()
+        self._threads = threads
+        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        self._process.start()
+        theirs.close()
+
+    def send(self, task: str, request: BaseModel) -> None:
+        """Hand over some work."""
+        try:
+            self._pipe.send((task, request))
+        except RecursionError as error:
+            raise Refused("the request is nested too deeply") from error
+        except OSError as error:
+            raise Broken(f"the process was gone before it began: {error}") from error
+
+    async def answer(self) -> AsyncIterator[bytes]:
+        """Yield the messages of the work as they come."""
+        loop = asyncio.get_running_loop()
+        while True:
+            kind, content = await loop.run_in_executor(self._threads, self._receive)
+            if kind == "message":
+                yield content
+            elif kind == "end":
+                return
+            else:
+                raise (Refused if kind == "refused" else Broken)(content)
+
+    def _receive(self) -> tuple[str, Any]:
+        try:
+            return self._pipe.recv()
+        except (EOFError, OSError) as error:
+            return "broken", f"the process ended: {error!r}"
+
+    def kill(self) -> None:
+        """End it, whatever it does."""
+        self._process.kill()
+
+
+def _serve(pipe: Connection) -> None:
+    """Work until nobody asks any more."""
+    import torch
+
+    from stackgen.studio.tasks import TASKS, warm_up
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this
+    torch.set_num_threads(1)
+    warm_up()
+    pipe.send(("end", None))  # it is ready
+    while True:
+        try:
+            task, request = pipe.recv()
+        except (EOFError, OSError):
+            return
+        try:
+            TASKS[task](request, lambda message: pipe.send(("message", json.dumps(message, allow_nan=False).encode())))
+            pipe.send(("end", None))
+        except StackgenError as error:
+            pipe.send(("refused", printable(error)))
+        except BrokenPipeError:
+            return
+        except Exception as error:  # noqa: BLE001 - the server stays up, and says so in its log
+            traceback.print_exc()
+            pipe.send(("broken", f"{type(error).__name__}: {error}"))

@@ -1,0 +1,192 @@
+// A pane: one method's answer to the drawing, from the noise to what can be downloaded.
+
+import { isAbort, messages, told } from "../api";
+import { button, el, labelled } from "../dom";
+import type { Message, Method, Pose, Start, StackFacts, StacksFile, Wish } from "../types";
+import { Disturbances } from "./disturb";
+import { downloads } from "./downloads";
+import { explain } from "./marks";
+import { overlays } from "./overlays";
+import { Stage } from "./stage";
+import { why } from "./why";
+
+const NOISE_RATE = 14; // frames of denoising in a second
+
+export class Pane {
+  readonly element: HTMLElement;
+  readonly stage: Stage;
+  private readonly title = el("h3");
+  private readonly state = el("p", { class: "state", role: "status" });
+  private readonly tabs = el("div", { class: "tabs", role: "tablist", "aria-label": "Structures" });
+  private readonly facts = el("div", { class: "facts" });
+  private readonly disturbances: Disturbances;
+  private readonly tools: HTMLElement;
+  private readonly weights = el("input", { type: "checkbox", change: () => this.markWeights() });
+  private stacks: StackFacts[] = [];
+  private file: Extract<Message, { kind: "file" }> | null = null;
+  private shown = 0;
+  private running: AbortController | null = null;
+
+  constructor(
+    private readonly start: Start,
+    private readonly number: number,
+    private readonly onBlocks: (counts: Record<string, number>) => void,
+  ) {
+    this.stage = new Stage(start.shapes, `Structure ${number}`);
+    this.disturbances = new Disturbances(this.stage);
+    this.stage.world.onPick = (block) => this.disturbances.choose(block);
+    const explosion = el("input", { type: "range", min: 0, max: 1.5, step: 0.01, value: 0, "aria-label": "Explode" });
+    explosion.addEventListener("input", () => this.stage.world.explode(Number(explosion.value)));
+    const home = button("Front view", () => this.show(this.shown, false));
+    const again = button("Drop it again", () => void this.drop());
+    this.tools = el(
+      "div",
+      { class: "tools", hidden: true },
+      el("div", { class: "row" }, again, home, labelled("Explode", explosion), el("label", { class: "check" }, this.weights, "Show weights")),
+      this.disturbances.element,
+    );
+    this.element = el(
+      "section",
+      { class: "pane", "aria-label": `Method ${number}` },
+      el("header", {}, this.title, this.state),
+      this.stage.element,
+      this.tabs,
+      this.facts,
+      this.tools,
+    );
+  }
+
+  /** Asks a method for stacks, and shows how they come to be. */
+  async run(method: Method, drawing: { cells: number; bits: string }, wish: Wish): Promise<void> {
+    this.cancel();
+    const running = (this.running = new AbortController());
+    this.clear(method);
+    const began = performance.now();
+    let frames: Pose[][] = [];
+    let arrange: (stacks: Pose[][]) => Pose[] = () => [];
+    let noise: Promise<void> | null = null;
+    let [checked, standing] = [0, 0];
+    try {
+      for await (const message of messages<Message>("/api/generate", { drawing, wish: { ...wish, method: method.name } }, running.signal)) {
+        if (message.kind === "blocks") {
+          arrange = this.stage.arrange(message.shapes, message.draws);
+          this.stage.say(method.steps ? "denoising …" : "proposing …", "busy");
+        } else if (message.kind === "noise") {
+          frames.push(arrange(message.stacks));
+          if (!noise) {
+            this.element.dataset.firstFrame = String(Math.round(performance.now() - began));
+            noise = this.stage.playClip({ frames, rate: NOISE_RATE }, true);
+          }
+          if (message.step >= message.steps) this.stage.player.finish();
+        } else if (message.kind === "checked") {
+          [checked, standing] = [checked + 1, standing + Number(message.stable)];
+          this.state.textContent = `${standing} of ${checked} simulated stand`;
+        } else if (message.kind === "file") {
+          this.take(message, began);
+        } else if (message.kind === "stack") {
+          this.add(message);
+        }
+      }
+      await noise;
+      if (!running.signal.aborted) this.choose(0);
+    } catch (error) {
+      if (running.signal.aborted && isAbort(error)) this.stage.say("cancelled");
+      else this.refuse(told(error));
+    } finally {
+      if (this.running === running) this.running = null;
+    }
+  }
+
+  cancel(): void {
+    this.running?.abort();
+    this.running = null;
+  }
+
+  /** Shows a file that was made before. */
+  open(title: string, file: StacksFile, stacks: StackFacts[]): void {
+    this.cancel();
+    this.clear({ name: "", title, steps: null });
+    this.take({ kind: "file", file, command: "", picture: "", notes: [] }, null);
+    for (const [number, stack] of stacks.entries()) this.add({ kind: "stack", number, ...stack });
+    this.choose(0);
+  }
+
+  private clear(method: Method): void {
+    this.stacks = [];
+    this.file = null;
+    this.tools.hidden = true;
+    this.title.textContent = method.title;
+    this.state.textContent = "";
+    this.stage.say("asking …", "busy");
+    this.disturbances.reset();
+    this.tabs.replaceChildren();
+    this.facts.replaceChildren();
+    delete this.element.dataset.done;
+  }
+
+  private refuse(sentence: string): void {
+    this.stage.say("no answer", "falls");
+    this.facts.replaceChildren(el("p", { class: "error", role: "alert" }, sentence));
+  }
+
+  private take(message: Extract<Message, { kind: "file" }>, began: number | null): void {
+    this.file = message;
+    const seconds = began === null ? "" : ` in ${((performance.now() - began) / 1000).toFixed(1)} s`;
+    const number = message.file.stacks.length;
+    this.state.textContent = `${number} structure${number === 1 ? "" : "s"}${seconds}`;
+    if (message.file.block_list) this.onBlocks(message.file.block_list);
+  }
+
+  private add({ number, ...stack }: Extract<Message, { kind: "stack" }>): void {
+    this.stacks.push(stack);
+    const text = stack.front_iou === null ? `${number + 1}` : `${number + 1} · ${stack.front_iou.toFixed(2)}`;
+    const verdict = stack.stable ? "stands" : "falls";
+    const tab = button(text, () => this.choose(number), { role: "tab", class: verdict, "aria-selected": "false", "aria-label": `Structure ${number + 1}, ${verdict}` });
+    this.tabs.append(tab);
+  }
+
+  private choose(number: number): void {
+    if (!this.stacks.length || !this.file) return;
+    this.show(number, true);
+    [...this.tabs.children].forEach((tab, i) => tab.setAttribute("aria-selected", String(i === number)));
+    const stack = this.stacks[number]!;
+    const size = this.file.file.grid.image_size;
+    this.facts.replaceChildren(
+      ...this.file.notes.map((note) => el("p", { class: "note" }, note)),
+      el("div", { class: "columns" }, why(stack, this.start.shapes), ...(stack.views ? [overlays(stack.views, size)] : [])),
+      downloads(this.file, number, this.stage.world),
+    );
+    this.disturbances.take(this.file.file, number, stack, this.start.shapes.map((shape) => shape.name));
+    this.tools.hidden = false;
+  }
+
+  private show(number: number, drop: boolean): void {
+    this.shown = number;
+    const stack = this.stacks[number];
+    if (!stack) return;
+    this.stage.present(stack.shapes, stack.frames[0]!);
+    this.disturbances.reset();
+    if (drop) void this.drop();
+    else this.stage.world.pose(stack.frames.at(-1)!);
+  }
+
+  /** Switches gravity on. */
+  private async drop(): Promise<void> {
+    const stack = this.stacks[this.shown]!;
+    this.disturbances.reset();
+    this.stage.say("gravity on", "busy");
+    await this.stage.playRollout(stack);
+    this.markWeights();
+    this.element.dataset.done = "";
+  }
+
+  private markWeights(): void {
+    const stack = this.stacks[this.shown];
+    if (!stack) return;
+    const marked = this.weights.checked || !stack.stable;
+    if (marked) this.stage.still();
+    if (marked && stack.first !== null) this.stage.world.mark([stack.first]);
+    this.stage.setMarks(marked ? explain(stack.statics) : null);
+    if (this.number) this.stage.say(stack.stable ? "stands" : "falls", stack.stable ? "stands" : "falls");
+  }
+}

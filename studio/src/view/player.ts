@@ -1,0 +1,81 @@
+// Plays frames of poses: smoothly between them, at their rate, as they come.
+
+import type { Clip, Pose } from "../types";
+
+export class Player {
+  clip: Clip = { frames: [], rate: 1 };
+  time = 0; // [s]
+  speed = 1;
+  playing = false;
+  private waiting = false; // for frames that are still to come
+  private ended: () => void = () => {};
+
+  constructor(
+    private readonly show: (poses: Pose[]) => void,
+    private readonly awake: () => void,
+    private readonly moved: (player: Player) => void = () => {},
+  ) {}
+
+  /** Plays a clip from its beginning; the promise says that it was played to its end. */
+  play(clip: Clip, more = false): Promise<void> {
+    Object.assign(this, { clip, time: 0, playing: true, waiting: more });
+    this.ended();
+    this.awake();
+    return new Promise((resolve) => (this.ended = resolve));
+  }
+
+  /** Says that no more frames come. */
+  finish(): void {
+    this.waiting = false;
+    this.awake();
+  }
+
+  get duration(): number {
+    return Math.max(0, this.clip.frames.length - 1) / this.clip.rate;
+  }
+
+  /** Stops, and shows one moment. */
+  seek(time: number): void {
+    this.playing = false;
+    this.time = Math.max(0, Math.min(this.duration, time));
+    this.draw();
+  }
+
+  toggle(): void {
+    if (!this.playing && this.time >= this.duration) this.time = 0;
+    this.playing = !this.playing;
+    this.draw();
+    this.awake();
+  }
+
+  /** Lets time pass; answers whether there is more to show. */
+  step(seconds: number): boolean {
+    if (!this.playing) return false;
+    this.time = Math.min(this.duration, this.time + seconds * this.speed);
+    this.draw();
+    if (this.time >= this.duration && !this.waiting) {
+      this.playing = false;
+      this.moved(this);
+      this.ended();
+      return false;
+    }
+    return true;
+  }
+
+  private draw(): void {
+    const { frames, rate } = this.clip;
+    if (!frames.length) return;
+    const place = Math.min(frames.length - 1, this.time * rate);
+    const [from, to] = [frames[Math.floor(place)]!, frames[Math.ceil(place)]!];
+    this.show(from === to ? from : from.map((pose, i) => between(pose, to[i]!, place % 1)));
+    this.moved(this);
+  }
+}
+
+export function between(a: Pose, b: Pose, t: number): Pose {
+  const sign = a[3] * b[3] + a[4] * b[4] + a[5] * b[5] + a[6] * b[6] < 0 ? -1 : 1;
+  const mixed = a.map((value, i) => value + ((i > 2 ? sign : 1) * b[i]! - value) * t) as Pose;
+  const length = Math.hypot(mixed[3], mixed[4], mixed[5], mixed[6]) || 1;
+  for (let i = 3; i < 7; i++) mixed[i]! /= length;
+  return mixed;
+}
