@@ -21,8 +21,8 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
+import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 A = (0.0, -0.425, -0.39225, 0.0, 0.0, 0.0)
 D = (0.089159, 0.0, 0.0, 0.10915, 0.09465, 0.0823)
@@ -70,13 +70,13 @@ def forward(joints: np.ndarray, tool: np.ndarray) -> np.ndarray:
 def matrix(pose: np.ndarray) -> np.ndarray:
     """(4, 4) of a pose (6,)."""
     frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = Rotation.from_rotvec(pose[3:]).as_matrix(), pose[:3]
+    frame[:3, :3], frame[:3, 3] = cv2.Rodrigues(np.array(pose[3:], float))[0], pose[:3]
     return frame
 
 
 def vector(frame: np.ndarray) -> np.ndarray:
     """(6,) of a frame (4, 4)."""
-    return np.concatenate([frame[:3, 3], Rotation.from_matrix(frame[:3, :3]).as_rotvec()])
+    return np.concatenate([frame[:3, 3], cv2.Rodrigues(frame[:3, :3])[0].ravel()])
 
 
 def solve(pose: np.ndarray, near: np.ndarray, tool: np.ndarray) -> np.ndarray:
@@ -85,8 +85,8 @@ def solve(pose: np.ndarray, near: np.ndarray, tool: np.ndarray) -> np.ndarray:
 
     def error(q: np.ndarray) -> np.ndarray:
         frame = forward(q, tool)
-        turn = Rotation.from_matrix(goal[:3, :3] @ frame[:3, :3].T).as_rotvec()
-        return np.concatenate([goal[:3, 3] - frame[:3, 3], turn])
+        turn = goal[:3, :3] @ frame[:3, :3].T  # its skew part is the rotation vector, as long as that is small
+        return np.concatenate([goal[:3, 3] - frame[:3, 3], (turn - turn.T)[[2, 0, 1], [1, 2, 0]] / 2])
 
     for _ in range(30):
         now = error(joints)
