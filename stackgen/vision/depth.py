@@ -169,6 +169,8 @@ def find_structure(frame: DepthFrame) -> SeenStructure:
     holes = _failed_within(frame, seen)
     picture, outline = _straight_on(frame, seen, holes, planes)
     front = largest(smoothed(picture, MEDIAN), round(JOINT / PIXEL))
+    if not front.any():
+        raise StackgenError(f"what stands in front of the background is smaller than {1e3 * MEDIAN * PIXEL:g} mm")
     rows, columns = bounding_box(front)
     size = ((columns.stop - columns.start) * PIXEL, (rows.stop - rows.start) * PIXEL)
     whole = np.count_nonzero(seen)

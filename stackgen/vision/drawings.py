@@ -129,7 +129,10 @@ def _framed(levels: Levels, place: tuple[int, int]) -> tuple[Levels, tuple[int, 
         part = levels[top:bottom, left:right]
         widths = [_border(np.rot90(part, turns), ground) for turns in range(4)]  # of the top, right, bottom and left
         top, right, bottom, left = top + widths[0], right - widths[1], bottom - widths[2], left + widths[3]
-    return levels[top:bottom, left:right], (place[0] + left, place[1] + top)
+    rest = levels[top:bottom, left:right]
+    if (np.quantile(rest, 0.995) - np.quantile(rest, 0.005)) < _CONTRAST and rest.mean() < levels[0].mean() - _CONTRAST:
+        return levels, place  # no border, but a dark structure with little paper around it
+    return rest, (place[0] + left, place[1] + top)
 
 
 def _border(levels: Levels, ground: NDArray[np.floating]) -> int:
@@ -310,8 +313,8 @@ class Look:
 
     @property
     def sheetless(self) -> bool:
-        """Whether no sheet of paper can be in it: a picture that no camera took, or one of two tones on white."""
-        return (self.flat and (self.two_tone or self.even)) or (self.two_tone and self.on_white)
+        """Whether no sheet of paper can be in it: a picture that no camera took, or one of two tones on even white."""
+        return (self.flat and (self.two_tone or self.even)) or (self.two_tone and self.even and self.on_white)
 
     @property
     def drawn(self) -> bool:

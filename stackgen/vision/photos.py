@@ -15,12 +15,11 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from stackgen.errors import StackgenError
 from stackgen.vision.images import Picture
 from stackgen.vision.lines import strong, without_rules
-from stackgen.vision.masks import components
+from stackgen.vision.masks import components, extent, largest
 from stackgen.vision.sheets import FOCAL, Sheet, least_channel, straightened
 from stackgen.world import Mask
 
@@ -71,7 +70,7 @@ def read_page(photo: Picture, sheet: Sheet | None) -> Page:
     Raises:
         StackgenError: If nothing is drawn.
     """
-    if sheet is None:
+    if sheet is None or sheet.seen < 3:
         factor = WORK_SIZE / max(photo.shape[:2])
         how = cv2.INTER_AREA if factor < 1 else cv2.INTER_LINEAR
         straight = np.asarray(cv2.resize(photo, None, fx=factor, fy=factor, interpolation=how), np.uint8)
@@ -80,13 +79,21 @@ def read_page(photo: Picture, sheet: Sheet | None) -> Page:
         straight, turn = straightened(photo, sheet, WORK_SIZE)
     ink, darkness = find_ink(straight)
     if sheet is not None:
-        _clear_edge(ink)
+        _clear_edge(ink, sheet.corners, turn)
     ink, ruled = without_rules(ink, darkness)
     ink = strong(ink, darkness)
     if np.count_nonzero(ink) < 2e-4 * ink.size:
         raise StackgenError("nothing is drawn on the sheet; draw a structure with a dark pen, filled or in outline")
     notes = ("The lines of the paper were removed.",) if ruled else ()
     return Page(ink, turn, sheet, notes, float(np.median(darkness[ink])))
+
+
+def is_drawn_on(photo: Picture, sheet: Sheet) -> bool:
+    """Tell whether something is drawn on a sheet; what is light within a drawing of two tones is blank."""
+    straight, turn = straightened(photo, sheet, WORK_SIZE // 3)
+    ink, _ = find_ink(straight)
+    _clear_edge(ink, sheet.corners, turn)
+    return extent(largest(ink, 3)) > 0.1 * max(ink.shape)
 
 
 def find_ink(sheet: Picture) -> tuple[Mask, NDArray[np.float32]]:
@@ -131,11 +138,14 @@ def _solids(paper: NDArray[np.uint8]) -> tuple[Mask, NDArray[np.float32]]:
     return np.asarray(full), np.where(full, 1 - paper / base, 0).astype(np.float32)
 
 
-def _clear_edge(ink: Mask) -> None:
-    """Remove ink that lies along the sheet's edge, where the table or the paper's thickness shows."""
+def _clear_edge(ink: Mask, corners: Floats, turn: Floats) -> None:
+    """Remove ink beyond the sheet and along its edge, where the table or the paper's thickness shows."""
     margin = max(2, round(_MARGIN * max(ink.shape)))
-    ink[:margin] = ink[-margin:] = False
-    ink[:, :margin] = ink[:, -margin:] = False
+    inside = np.zeros(ink.shape, np.uint8)
+    there = cv2.perspectiveTransform(corners[None].astype(np.float64), turn)[0]
+    cv2.fillPoly(inside, [np.round(there).astype(np.int32)], 1)
+    cv2.polylines(inside, [np.round(there).astype(np.int32)], True, 0, 2 * margin + 1)
+    ink &= inside > 0
 
 
 def straight_up(mask: Mask) -> Mask:
@@ -157,6 +167,8 @@ def straight_up(mask: Mask) -> Mask:
         angles = _angles(_seen_turned(sides, turns, middle, focal))
         wrong = np.where(upright, np.abs(angles) - np.pi / 2, angles)
         return np.concatenate([weights * wrong, turns / _HELD])
+
+    from scipy.optimize import least_squares  # here: importing it costs most pictures more than reading them
 
     turns = np.asarray(least_squares(off, np.zeros(3), loss="soft_l1").x)
     around = np.concatenate(contours)[:, 0].astype(np.float64)

@@ -24,7 +24,7 @@ from stackgen.vision.lines import without_rules
 from stackgen.vision.masks import bounding_box, filling, place
 from stackgen.vision.options import PictureKind, PictureOptions
 from stackgen.vision.outlines import choose
-from stackgen.vision.photos import read_page, straight_up
+from stackgen.vision.photos import is_drawn_on, read_page, straight_up
 from stackgen.vision.sheets import Sheet, find_sheet
 from stackgen.world import Grid, Mask
 
@@ -136,10 +136,10 @@ def read_picture(
         look = drawings.look_at(image)
         drawn = image.alpha is not None or look.sheetless or min(image.colours.shape[:2]) < LEAST_PHOTO
         sheet = None if as_ == "drawing" or drawn else find_sheet(image.colours)
-        if look.two_tone and sheet is not None and not sheet.whole:
-            sheet = None  # in a crop of two tones the ground is cut off just so
+        if sheet is not None and (look.two_tone or sheet.seen < 4) and not is_drawn_on(image.colours, sheet):
+            sheet = None  # the ground between two strokes, or within a doorway, is no sheet
         if as_ == "photo" or (as_ is None and not drawn and (sheet is not None or not look.drawn)):
-            return _of_photo(image, sheet, look.even, which)
+            return _of_photo(image, sheet, which, look.even, insisted=as_ is not None)
         return _of_drawing(image, grid, which, look.flat, insisted=as_ is not None)
     except StackgenError as error:
         raise StackgenError(f"{images.name_of(source)}: {error}") from error
@@ -189,23 +189,25 @@ def _of_drawing(image: Image8, grid: Grid, which: int | None, flat: bool, insist
     return Reading(_figure(found.mask), "drawing", sure, overlay, (*drawn.notes, *found.notes), exact=exact)
 
 
-def _of_photo(image: Image8, sheet: Sheet | None, even: bool, which: int | None) -> Reading:
-    """Read the photo of a sketch; on even ground what is found is no sheet."""
+def _of_photo(image: Image8, sheet: Sheet | None, which: int | None, even: bool, insisted: bool) -> Reading:
+    """Read the photo of a sketch; on even ground what is found is no sheet, and may be cropped to its edges."""
     if min(image.colours.shape[:2]) < LEAST_PHOTO:
         height, width = image.colours.shape[:2]
         raise StackgenError(f"the photo is only {width} x {height} pixels; take a larger one")
     page = read_page(image.colours, sheet)
-    found = choose(page.ink, which)
+    found = choose(page.ink, which, spread=sheet is None and even and not insisted)
     if sheet is None and not even and cv2.contourArea(_hull(found.mask)) > 0.55 * found.mask.size:
         raise StackgenError(_UNCLEAR)
     notes = page.notes
     if sheet is None:
         notes = (*notes, "No sheet's edges are seen, so proportions are uncertain.")
+    elif sheet.seen < 3:
+        notes = (*notes, "Only two sides of the sheet are seen, so proportions are uncertain.")
     elif sheet.slanted:
         notes = (*notes, "The sheet is seen at a slant, so proportions are uncertain.")
     sure = found.sureness * (0.8 if sheet is None else sheet.sureness) * min(1.0, 0.5 + page.contrast)
     overlay = _outlined(image.colours, found.mask, np.asarray(np.linalg.inv(page.turn)))
-    upright = found.mask if sheet is not None else straight_up(found.mask)
+    upright = found.mask if sheet is not None and sheet.seen > 2 else straight_up(found.mask)
     if sheet is not None:
         _polygon(overlay, sheet.corners, _GREEN)
     return Reading(_figure(upright, by_hand=True), "photo", sure, overlay, (*notes, *found.notes))

@@ -1,25 +1,26 @@
 """The sheet of paper in a photo: where it lies, and how it looks straight on.
 
-Paper is told from a table by its whiteness, by its colour, which a shadow does not change, and by its edge, which is
-sharper than a shadow's. Each way proposes quadrangles; the one counts whose sides are the clearest steps from light to
-dark, taken on the spot, so that a shadow across a side does no harm. A side may lie beyond the photo's edge.
+Its sides are straight edges. Of all quadrangles of edges that are seen, and of the photo's own, the one counts all
+along whose sides it is lighter, or more colourless, inside than outside. This is judged from place to place, so that
+a shadow across a side does no harm; what a shadow divides off is smaller, and counts less.
 
-Legend: h x w pixels of the photo; corners (4, 2) as x, y from the upper left clockwise.
+Legend: h x w pixels of the photo, N lines, Q quadrangles, T places along a line; corners (4, 2) as x, y from the upper
+left clockwise; lines (N, 2, 2) as two points a pixel apart.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.vision.images import Picture
-from stackgen.world import Mask
+from stackgen.vision.images import Picture, as_bytes
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 FOCAL = 0.75
 """Focal length of a usual camera by the photo's longer edge: a telephone's, a webcam's or a RealSense's is near it."""
@@ -38,9 +39,18 @@ LEAST_SHEET = 0.05
 SUPPORT = 0.6
 """Least share of each side of a sheet along which it is lighter inside than outside."""
 
-_AT_EDGE = 4.0  # what is nearer to the photo's edge is cut off by it [pixel at which the sheet is looked for]
+_SEARCH = 400  # longer edge at which the sheet is looked for; all lengths below are pixels of this
 
-_SEARCH = 400  # longer edge at which the sheet is looked for [pixel]
+_TRIED = 60  # edges along which light is looked at
+_MOST_LINES = 14  # those of them that may be sides, beside the photo's own
+_REACH = 500  # how far a line is followed to either side
+_BESIDE = 5  # how far from a side inside and outside are compared
+_BEYOND = 14  # so far from it, to one side, a mere line is as it is on the other
+_LEAST_SEEN = 15  # a side of which less is seen tells nothing
+_AT_EDGE = 4.0  # what is nearer to the photo's edge is cut off by it
+_LEVEL = 0.95  # light beyond a dark line by that before it
+
+_UNSEEN = 0.8  # what each side costs that is not seen
 
 
 @dataclass(frozen=True)
@@ -50,12 +60,12 @@ class Sheet:
     Args:
         corners: (4, 2) corners [pixel], which may lie outside of the photo.
         sureness: How clear its sides are, 0..1.
-        whole: Whether all four sides are seen; else its length is unknown.
+        seen: Number of its sides that are seen; three tell how it lies, and four its proportions.
     """
 
     corners: Floats
     sureness: float
-    whole: bool = True
+    seen: int = 4
 
     @property
     def slanted(self) -> bool:
@@ -69,36 +79,192 @@ def find_sheet(photo: Picture) -> Sheet | None:
     factor = _SEARCH / max(photo.shape[:2])
     small = np.asarray(cv2.resize(photo, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA), np.uint8)
     small = np.asarray(cv2.medianBlur(small, 5), np.uint8)
-    light, tint = least_channel(small).astype(np.float32), _tint(small)
-    best: tuple[float, Floats, float] | None = None
-    for region in _regions(small):
-        corners = _quadrangle(region)
-        if corners is None:
-            continue
-        corners = _refined(small, corners, reach=8)
-        if _is_frame(corners, region.shape):
-            continue
-        sureness, seen = _support(light, tint, corners)
-        shape = np.array(small.shape[1::-1])
-        area = cv2.contourArea(np.clip(corners, 0, shape).astype(np.float32)) / shape.prod()
-        score = sureness * area**0.25 * 0.9 ** (4 - seen)
-        if sureness >= SUPPORT and (best is None or score > best[0] + 1e-3):
-            best = score, corners, sureness
-    if best is None:
+    found = _best_quadrangle(small, np.concatenate([_edges(small), _frame(small.shape)]))
+    if found is None:
         return None
-    corners = _refined(photo, best[1] / factor, reach=max(2.0, 3 / factor))
-    cut = _cut_side(best[1], small.shape)
-    return Sheet(corners, best[2]) if cut is None else Sheet(_completed(corners, cut, photo.shape), best[2], False)
+    corners, sureness = found
+    cut = _cut_sides(corners, small.shape)
+    corners = _refined(photo, corners / factor, reach=max(2.0, 3 / factor))
+    if len(cut) == 1:
+        corners = _completed(corners, cut[0], photo.shape)
+    return Sheet(corners, sureness, 4 - len(cut))
 
 
-def _cut_side(corners: Floats, shape: tuple[int, ...]) -> int | None:
-    """Return the number of the side that is an edge of the photo rather than of the sheet, None where there is none."""
+def _edges(small: Picture) -> Floats:
+    """Find straight edges (N, 2, 2) of light and colour; ink is closed before."""
+    detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD)
+    pieces = []
+    for levels in (_log(least_channel(small)), _log(small.max(axis=2)), _tint(small)):
+        closed = cv2.morphologyEx(as_bytes(levels), cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
+        found = detector.detect(closed)[0]
+        if found is not None:
+            pieces.append(found.reshape(-1, 2, 2).astype(np.float64))
+    if not pieces:
+        return np.zeros((0, 2, 2))
+    ends = np.concatenate(pieces)
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    order = np.argsort(-lengths)[: np.count_nonzero(lengths > 0.03 * _SEARCH)]
+    return _joined(ends[order])
+
+
+def _joined(ends: Floats) -> Floats:
+    """Join pieces of edges (n, 2, 2), the longest first, to lines (N, 2, 2)."""
+    free = np.ones(len(ends), dtype=bool)
+    lines = []
+    for number in range(len(ends)):
+        if not free[number]:
+            continue
+        at, along = ends[number, 0], ends[number, 1] - ends[number, 0]
+        for _ in range(2):
+            across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+            members = np.abs((ends - at) @ across).max(axis=1) < 3
+            x, y, *there = cv2.fitLine(
+                ends[members].reshape(-1, 2).astype(np.float32), cv2.DIST_L2, 0, 0.01, 0.01
+            ).ravel()
+            at, along = np.array(there, np.float64), np.array([x, y], np.float64)
+        free &= ~members
+        lines.append([at, at + along])
+    return np.array(lines[:_TRIED]).reshape(-1, 2, 2)
+
+
+def _log(levels: Picture) -> NDArray[np.float32]:
+    """Return levels such that equal shares of light are equal steps."""
+    return np.log(levels.astype(np.float32) + 12)
+
+
+def _frame(shape: tuple[int, ...]) -> Floats:
+    """Return the photo's own edges (4, 2, 2)."""
+    right, bottom = shape[1] - 1.0, shape[0] - 1.0
+    corners = np.array([[0, 0], [right, 0], [right, bottom], [0, bottom]])
+    return np.stack([corners, corners + [[1, 0], [0, 1], [-1, 0], [0, -1]]], axis=1)
+
+
+def _best_quadrangle(small: Picture, lines: Floats) -> tuple[Floats, float] | None:
+    """Return the corners of the quadrangle of lines (N, 2, 2) most like a sheet, and how clear its sides are."""
+    steps, depths, known = _steps(small, lines)
+    clearest = np.argsort(-depths[:, :-4, -1].max(axis=0))[:_MOST_LINES]
+    chosen = np.append(clearest, len(lines) + np.arange(-4, 0))
+    lines, steps, depths, known = lines[chosen], steps[:, chosen], depths[:, chosen], known[chosen]
+    sides, corners, ends = _quadrangles(lines, small.shape)
+    if not len(sides):
+        return None
+    across = _normals(lines)[sides]
+    inside = ((corners.mean(axis=1)[:, None] - lines[sides, 0]) * across).sum(axis=2) > 0
+    low, high = np.sort(ends, axis=2).transpose(2, 0, 1)
+    trimmed = 0.04 * (high - low)
+    start, end = (
+        np.clip(np.round(place + _REACH), 0, 2 * _REACH).astype(int) for place in (low + trimmed, high - trimmed)
+    )
+    of = known[sides, end] - known[sides, start]
+    seen = of >= _LEAST_SEEN
+
+    def least(told: Floats) -> Floats:
+        """Return the mean of what is told of the places along a side, of that side of each quadrangle of least."""
+        share = (told[inside * 1, sides, end] - told[inside * 1, sides, start]) / np.maximum(of, 1)
+        return np.asarray(np.where(seen, share, 1).min(axis=1))
+
+    sureness, depth = least(steps), least(depths)
+    areas = np.abs(_cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)) / 2 / (small.shape[0] * small.shape[1])
+    score = sureness * depth**0.5 * np.minimum(areas, 1) ** 0.25 * _UNSEEN ** np.count_nonzero(~seen, axis=1)
+    enough = (np.count_nonzero(seen, axis=1) > 2) | ((np.count_nonzero(seen, axis=1) == 2) & (areas > 0.5))
+    score[(sureness < SUPPORT) | ~enough | _is_frame(corners, small.shape)] = 0
+    best = int(score.argmax())
+    return (_clockwise(corners[best]), float(sureness[best])) if score[best] else None
+
+
+def _quadrangles(lines: Floats, shape: tuple[int, ...]) -> tuple[Ints, Floats, Floats]:
+    """Make quadrangles of lines (N, 2, 2), the last four of which are the photo's own edges.
+
+    Returns:
+        (Q, 4) numbers of the lines that are their sides; (Q, 4, 2) their corners, each at the end of its side; and
+        (Q, 4, 2) where along its line each side begins and ends [pixel].
+    """
+    along = lines[:, 1] - lines[:, 0]
+    angles = _cross(along[:, None], along)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        places = _cross(lines[:, 0] - lines[:, None, 0], along) / angles  # (N, N) of the crossing, along the first line
+    meet = (np.abs(angles) > 0.34) & (np.abs(places) < 3 * _REACH)
+    four = np.array(list(combinations(range(len(lines)), 4)))
+    around = np.concatenate([four, four[:, [0, 2, 1, 3]], four[:, [0, 1, 3, 2]]])
+    after = np.roll(around, -1, axis=1)
+    opposite = np.abs(angles[around[:, :2], around[:, 2:]]).max(axis=1) < 0.8
+    kept = meet[around, after].all(axis=1) & opposite & (np.count_nonzero(around >= len(lines) - 4, axis=1) <= 2)
+    around, after = around[kept], after[kept]
+    ends = np.stack([places[around, np.roll(around, 1, axis=1)], places[around, after]], axis=2)
+    corners = lines[around, 0] + ends[..., 1:] * along[around]
+    size = np.array(shape[1::-1])
+    near = ((corners > -0.6 * size) & (corners < 1.6 * size)).all(axis=(1, 2))
+    sides = corners - np.roll(corners, 1, axis=1)
+    turns = _cross(sides, np.roll(sides, -1, axis=1))
+    convex = (turns > 0).all(axis=1) | (turns < 0).all(axis=1)
+    large = np.abs(_cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)) > 2 * LEAST_SHEET * size.prod()
+    kept = near & convex & large
+    return around[kept], corners[kept], ends[kept]
+
+
+def _steps(small: Picture, lines: Floats) -> tuple[Floats, Floats, Floats]:
+    """Tell where along lines (N, 2, 2) it steps down from paper to table, as sums from their first place on.
+
+    Returns:
+        (2, N, T + 1) at how many places it does, with the paper on the one side and on the other; (2, N, T + 1) how
+        deep, up to 1 each; and (N, T + 1) at how many both sides are seen, none of the last four, the photo's own edges.
+    """
+    levels = [np.asarray(of, np.float32) for of in (least_channel(small), small.max(axis=2), _tint(small))]
+    size = np.array(small.shape[1::-1])
+    points = lines[:, :1] + np.arange(-_REACH, _REACH)[:, None] * (lines[:, 1:] - lines[:, :1])
+
+    def beside(shift: int) -> tuple[list[NDArray[np.float32]], NDArray[np.bool_]]:
+        there = np.round(points + shift * _normals(lines)[:, None]).astype(int)
+        x, y = np.clip(there, 0, size - 1).transpose(2, 0, 1)
+        return [of[y, x] for of in levels], np.asarray(((there >= 0) & (there < size)).all(axis=2))
+
+    counts, depths = [], []
+    for side in (-1, 1):
+        (light, value, tint), here = beside(side * _BESIDE)
+        (dark, low, dull), there = beside(-side * _BESIDE)
+        (far, _, away), _ = beside(-side * _BEYOND)
+        (within, _, _), _ = beside(side * _BEYOND)
+        known = here & there
+        known[-4:] = False
+        darker = np.log(np.maximum((light + 8) / (dark + 8), (value + 8) / (low + 8)))
+        down = np.maximum(darker / 0.13, (tint - dull) / 18)
+        dark_line = (far > _LEVEL * light) & (away > tint - 9)
+        light_line = within + 8 < 0.7 * (light + 8)
+        down[dark_line | light_line | ~known] = 0
+        counts.append(_counted(down >= 1))
+        depths.append(_counted(np.clip(down / 3, 0, 1)))
+    return np.stack(counts), np.stack(depths), _counted(known)
+
+
+def _counted(told: NDArray[np.generic]) -> Floats:
+    """Return the sums over the first 0, 1, ... T places (N, T + 1) of what is told of each (N, T)."""
+    return np.pad(np.cumsum(told, axis=1, dtype=np.float64), ((0, 0), (1, 0)))
+
+
+def _normals(lines: Floats) -> Floats:
+    """Return the directions (N, 2) square to lines (N, 2, 2)."""
+    along = lines[:, 1] - lines[:, 0]
+    return np.stack([-along[:, 1], along[:, 0]], axis=1)
+
+
+def _cross(one: Floats, two: Floats) -> Floats:
+    """Return the cross products (...) of vectors (..., 2)."""
+    return np.asarray(one[..., 0] * two[..., 1] - one[..., 1] * two[..., 0])
+
+
+def _is_frame(corners: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    """Tell which quadrangles (Q, 4, 2) are a border along the photo's edges rather than a sheet."""
+    ends = _frame(shape)[:, 0]
+    far = np.abs(corners[:, :, None] - ends).max(axis=3).min(axis=1).max(axis=1)
+    return np.asarray(far < 0.05 * max(shape))
+
+
+def _cut_sides(corners: Floats, shape: tuple[int, ...]) -> list[int]:
+    """Return the numbers of the sides that are edges of the photo rather than of the sheet."""
     far = np.array(shape[1::-1]) - 1
-    for number in range(4):
-        side = corners[[number, (number + 1) % 4]]
-        if (side.max(axis=0) <= _AT_EDGE).any() or ((far - side).max(axis=0) <= _AT_EDGE).any():
-            return number
-    return None
+    sides = np.stack([corners, np.roll(corners, -1, axis=0)], axis=1)
+    at_edge = (sides.max(axis=1) <= _AT_EDGE) | ((far - sides).max(axis=1) <= _AT_EDGE)
+    return np.flatnonzero(at_edge.any(axis=1)).tolist()
 
 
 def _completed(corners: Floats, cut: int, shape: tuple[int, ...]) -> Floats:
@@ -152,119 +318,6 @@ def _refined(photo: Picture, corners: Floats, reach: float) -> Floats:
     return moved if np.isfinite(moved).all() and np.abs(moved - corners).max() < 6 * reach else corners
 
 
-def least_channel(picture: Picture) -> NDArray[np.uint8]:
-    """Return the least channel (h, w) of a colour picture: that in which ink of any colour is dark, and wood, too."""
-    return np.asarray(cv2.min(cv2.min(picture[..., 0], picture[..., 1]), picture[..., 2]), np.uint8)
-
-
-def _is_frame(corners: Floats, shape: tuple[int, ...]) -> bool:
-    """Tell whether a quadrangle is a border along the picture's edges rather than a sheet."""
-    width, height = shape[1], shape[0]
-    ends = np.array([[0, 0], [width, 0], [width, height], [0, height]])
-    return bool(np.abs(corners - ends).max() < 0.05 * max(shape))
-
-
-def _tint(small: Picture) -> NDArray[np.float32]:
-    """Return how colourless each pixel is, 255 for grey: least by largest channel, which a shadow hardly changes."""
-    most = cv2.max(cv2.max(small[..., 0], small[..., 1]), small[..., 2]).astype(np.float32)
-    return np.asarray(255 * (least_channel(small).astype(np.float32) + 8) / (most + 8), np.float32)
-
-
-def _regions(small: Picture) -> Iterator[Mask]:
-    """Propose regions (h, w) that may be the sheet."""
-    light, tint = least_channel(small), _tint(small).astype(np.uint8)
-    for levels, shares in ((light, np.arange(1.1, 0.3, -0.08)), (tint, np.array([1.0, 0.95, 0.9]))):
-        level, _ = cv2.threshold(levels, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-        for share in shares:
-            if share * level < 250:
-                yield levels > share * level
-    yield from _flooded(small)
-    yield from _between_edges(small)
-
-
-def _flooded(small: Picture) -> Iterator[Mask]:
-    """Propose what is reached from the lightest place without a sharp step: shadows end softly, paper does not."""
-    soft = cv2.GaussianBlur(small, (0, 0), 1.0)
-    paper = cv2.morphologyEx(soft, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
-    level = cv2.blur(least_channel(np.asarray(paper, np.uint8)), (15, 15))
-    row, column = np.unravel_index(int(level.argmax()), level.shape)
-    for step in (3, 5, 8):
-        mask = np.zeros((small.shape[0] + 2, small.shape[1] + 2), np.uint8)
-        cv2.floodFill(
-            paper.copy(), mask, (int(column), int(row)), 0, (step,) * 3, (step,) * 3, 8 | cv2.FLOODFILL_MASK_ONLY
-        )
-        yield mask[1:-1, 1:-1] > 0
-
-
-def _between_edges(small: Picture) -> Iterator[Mask]:
-    """Propose what lies between edges, alone and by twos: a hard shadow divides a sheet."""
-    light = np.log(least_channel(small).astype(np.float32) + 12)
-    soft = cv2.GaussianBlur(cv2.morphologyEx(light, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8)), (0, 0), 1.2)
-    steep = np.hypot(cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1))
-    for level in (0.12, 0.25):
-        _, labels, parts, _ = cv2.connectedComponentsWithStats((steep < level).astype(np.uint8), connectivity=4)
-        order = [
-            i for i in np.argsort(-parts[:, cv2.CC_STAT_AREA]) if i and parts[i, cv2.CC_STAT_AREA] > 0.02 * light.size
-        ]
-        masks = [labels == i for i in order[:5]]
-        yield from masks
-        for first in range(len(masks)):
-            for second in range(first):
-                joined = (masks[first] | masks[second]).astype(np.uint8)
-                yield cv2.morphologyEx(joined, cv2.MORPH_CLOSE, np.ones((11, 11), np.uint8)) > 0
-
-
-def _quadrangle(region: Mask) -> Floats | None:
-    """Return the corners (4, 2) of the largest part of a region where its hull has four sides.
-
-    Sides that the photo's edge cuts off count last: three sides and the photo's edge are a sheet, too.
-    """
-    whole = cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-    contours, _ = cv2.findContours(whole, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
-    if not contours:
-        return None
-    contour = max(contours, key=lambda one: float(cv2.contourArea(one)))
-    hull = cv2.convexHull(contour)
-    area = float(cv2.contourArea(hull))
-    if not LEAST_SHEET * region.size <= area <= 0.985 * region.size or cv2.contourArea(contour) < 0.8 * area:
-        return None
-    around = cv2.approxPolyDP(hull, 0.006 * cv2.arcLength(hull, True), True)[:, 0].astype(np.float64)
-    if not 4 <= len(around) <= 10:
-        return None
-    lines = _four_sides(around, region.shape)
-    if lines is None:
-        return None
-    corners = np.array([_crossing(one, two) for one, two in zip(np.roll(lines, 1, axis=0), lines, strict=True)])
-    limits = 0.6 * np.array(region.shape[::-1])
-    if (
-        not np.isfinite(corners).all()
-        or (corners < -limits).any()
-        or (corners > 1.6 * np.array(region.shape[::-1])).any()
-    ):
-        return None
-    flat = corners.astype(np.float32)
-    inside = np.zeros(region.shape, np.uint8)
-    cv2.fillPoly(inside, [np.round(corners).astype(np.int32)], 1)
-    filled = np.zeros(region.shape, np.uint8)
-    cv2.fillPoly(filled, [hull], 1)
-    same = int(np.count_nonzero(inside & filled)) / max(1, int(np.count_nonzero(inside | filled)))
-    return _clockwise(corners) if cv2.isContourConvex(flat) and same > 0.9 else None
-
-
-def _four_sides(around: Floats, shape: tuple[int, ...]) -> Floats | None:
-    """Choose four sides (4, 2, 2) of a polygon in order, those off the photo's edge first, then the longest."""
-    sides = np.stack([around, np.roll(around, -1, axis=0)], axis=1)
-    lengths = np.linalg.norm(sides[:, 1] - sides[:, 0], axis=1)
-    far = np.array(shape[1::-1]) - 1
-    cut = (sides.max(axis=1) <= 2).any(axis=1) | ((far - sides).max(axis=1) <= 2).any(axis=1)
-    minor = cut | (lengths < 0.12 * max(shape))
-    order = np.lexsort((-lengths, minor))
-    chosen = np.sort(order[:4])
-    if np.count_nonzero(~cut[chosen]) < 3:
-        return None
-    return sides[chosen]
-
-
 def _crossing(one: Floats, two: Floats) -> Floats:
     """Return where two lines (2, 2) cross; nan where they are parallel."""
     (p, q), (r, s) = one, two
@@ -275,28 +328,15 @@ def _crossing(one: Floats, two: Floats) -> Floats:
     return np.asarray(p + ((r - p)[0] * b[1] - (r - p)[1] * b[0]) / across * a)
 
 
-def _support(light: NDArray[np.float32], tint: NDArray[np.float32], corners: Floats) -> tuple[float, int]:
-    """Return the share of a quadrangle's sides that step down, that of the least side, and how many sides are seen."""
-    height, width = light.shape
-    middle = corners.mean(axis=0)
-    least, seen = 1.0, 0
-    for start, end in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        along = (end - start) / max(float(np.linalg.norm(end - start)), 1e-6)
-        inward = np.array([-along[1], along[0]])
-        inward *= np.sign((middle - start) @ inward)
-        points = start + (end - start) * np.linspace(0.04, 0.96, 60)[:, None]
-        inside, outside, beyond = (np.round(points + shift * inward).astype(int) for shift in (5, -5, -14))
-        known = ((inside >= 0) & (outside >= 0) & (inside < [width, height]) & (outside < [width, height])).all(axis=1)
-        if np.count_nonzero(known) < 15:
-            continue
-        (x, y), (u, v) = inside[known].T, outside[known].T
-        darker = (light[v, u] + 8) / (light[y, x] + 8)
-        duller = tint[v, u] - tint[y, x]
-        far, away = np.clip(beyond[known], 0, [width - 1, height - 1]).T  # beyond a mere line it is light again
-        paper = (light[away, far] > 0.95 * light[y, x]) & (tint[away, far] > tint[y, x] - 9)
-        least = min(least, float((((darker < 0.88) | (duller < -18)) & ~paper).mean()))
-        seen += 1
-    return (least if seen >= 2 else 0.0), seen
+def least_channel(picture: Picture) -> NDArray[np.uint8]:
+    """Return the least channel (h, w) of a colour picture: that in which ink of any colour is dark, and wood, too."""
+    return np.asarray(cv2.min(cv2.min(picture[..., 0], picture[..., 1]), picture[..., 2]), np.uint8)
+
+
+def _tint(small: Picture) -> NDArray[np.float32]:
+    """Return how colourless each pixel is, 255 for grey: least by largest channel, which a shadow hardly changes."""
+    most = cv2.max(cv2.max(small[..., 0], small[..., 1]), small[..., 2]).astype(np.float32)
+    return np.asarray(255 * (least_channel(small).astype(np.float32) + 8) / (most + 8), np.float32)
 
 
 def _clockwise(corners: Floats) -> Floats:
@@ -324,7 +364,7 @@ def straightened(photo: Picture, sheet: Sheet, size: int) -> tuple[Picture, Floa
     """
     corners = sheet.corners
     ratio = sheet_ratio(corners - np.array(photo.shape[1::-1]) / 2, max(photo.shape))
-    ratio = _usual(ratio) if sheet.whole else ratio
+    ratio = _usual(ratio) if sheet.seen == 4 else ratio
     width, height = (size, round(size / ratio)) if ratio > 1 else (round(size * ratio), size)
     there = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float32)
     turn = cv2.getPerspectiveTransform(corners.astype(np.float32), there)

@@ -234,6 +234,15 @@ def test_another_grid_gives_its_own_size() -> None:
     ).mean() > 0.98
 
 
+@pytest.mark.parametrize("margin", [6, 10, 40])
+def test_a_wall_is_no_border_however_little_paper_is_left_around_it(margin: int) -> None:
+    wall = np.pad(np.full((420, 420), 30, np.uint8), margin, constant_values=245)
+    assert read_silhouette(wall).sum() == pytest.approx(56**2, abs=60)
+    if margin < 40:  # a frame around an empty sheet
+        with pytest.raises(StackgenError, match="one colour"):
+            read_silhouette(255 - wall)
+
+
 def truncated(path: Path) -> None:
     buffer = io.BytesIO()
     painted(silhouette(stack_of("gate"), LARGE)).save(buffer, "PNG" if path.suffix == ".png" else "JPEG")
