@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stackgen.api.model import BlockList, Model, Silhouette, load
 from stackgen.errors import StackgenError
 from stackgen.io.stacks_file import StackEntry, StacksFile
+from stackgen.sampling.verified import Budget
 from stackgen.search.problem import SearchSettings
 from stackgen.search.sampler import SearchSampler
 from stackgen.search.scale import MOST_BLOCKS, Cells
@@ -59,7 +60,7 @@ def best(
 
     def proposals(target: Mask, block_list: NDArray[np.int64] | None) -> list[Stack]:
         given = inventory if block_list is None else None
-        return _network().sample_verified(target, num_samples, seed, block_list, given).stacks
+        return _network().sample_verified(target, num_samples, seed, block_list, given, budget=_PROPOSED).stacks
 
     asked = Model(SearchSampler(), checker=SimulatorChecker())
     Model._check_draw(num_samples, seed)
@@ -100,6 +101,10 @@ def best(
         cell_size=physics.cell_size,
         comment=_told(found, num_samples),
     )
+
+
+_PROPOSED = Budget(16)
+"""Stacks that the network draws where it is asked."""
 
 
 @cache

@@ -31,7 +31,7 @@ Ints = NDArray[np.int64]
 Proposals = Callable[[Mask, Ints | None], Sequence[Stack]]
 """Function that proposes stacks for a target (H, W) and a block list (S,), if one is known."""
 
-ENOUGH = 0.9
+ENOUGH = 0.8
 """Front IoU of the search's best stack from which on nobody else is asked."""
 
 
