@@ -93,8 +93,8 @@ class Balance:
         """
         if self.hangs:
             return False
-        lack, certain = self._passed_on(slope)
-        if not lack or (certain and not loaded):
+        lack, certain = self._passed_on(slope, loaded)
+        if not lack or certain:
             return not lack
         effects = self._effects(slope, loaded)
         return has_solution(linear_program(effects, np.zeros(effects.shape[1]), self._needed))
@@ -103,8 +103,8 @@ class Balance:
         """Add up how far from their supports loads come to lie that are passed on to the nearest [weight x cell]."""
         return np.inf if self.hangs else self._passed_on(slope)[0]
 
-    def _passed_on(self, slope: float) -> tuple[float, bool]:
-        """Pass all loads on from the top.
+    def _passed_on(self, slope: float, loaded: Sequence[int] = ()) -> tuple[float, bool]:
+        """Pass all loads on from the top; weights are put on blocks that may be `loaded` where that brings balance.
 
         Returns:
             How far loads come to lie from their supports, in all: 0 if forces were found that hold the blocks. And
@@ -115,9 +115,11 @@ class Balance:
             [(low + slope * height, high + slope * height, by) for low, high, by in those]
             for those, height in zip(self.supports, self.heights, strict=True)
         ]
-        firm: list[_Reach | None] = [None] * len(centres)
+        parts: list[_Reach | None] = [None] * len(centres)
+        firm = parts.copy()
         for i in self.upwards:
-            firm[i] = _firm(centres[i], supports[i], firm)
+            parts[i] = reach = _firm_parts(supports[i], firm)
+            firm[i] = reach if reach and _is_within(centres[i], reach) else None
         force = list(self.weights)
         torque = [weight * centre for weight, centre in zip(force, centres, strict=True)]
         shared = [False] * len(centres)  # who bears a part of a load that could be shared out otherwise
@@ -125,12 +127,14 @@ class Balance:
         for i in reversed(self.upwards):
             load, those = force[i], supports[i]
             place, reach = torque[i] / load, firm[i]
-            if reach is None or not reach[0] - _CLOSE <= place <= reach[1] + _CLOSE:
-                reach = _reach(those)
-                distance = max(reach[0] - place, place - reach[1])
-                if distance > _CLOSE:
-                    lack += load * distance
-                    certain |= not shared[i]
+            if not reach or not _is_within(place, reach):
+                reach = (parts[i] if i in loaded else None) or _reach(those)
+                if not _is_within(place, reach) and i in loaded:
+                    load, place = self._weighed_down(i, slope, load, place, reach)
+                if not _is_within(place, reach):
+                    reach = _reach(those)
+                    lack += load * max(reach[0] - place, place - reach[1], 0.0)
+                    certain |= not shared[i] and not loaded
             for share, at, by in _shares(place, reach, centres):
                 if by >= 0:
                     force[by] += share * load
@@ -139,6 +143,15 @@ class Balance:
                 for _, _, by in those:
                     shared[by] |= by >= 0
         return lack, certain or not lack
+
+    def _weighed_down(self, block: int, slope: float, load: float, place: float, reach: _Reach) -> tuple[float, float]:
+        """Put a weight on the end of a block's head, if that brings its load to the near end of what it stands on."""
+        first, last, height = self.heads[block] or (place, place, 0.0)
+        goal, end = (reach[0], last) if place < reach[0] else (reach[1], first)
+        way, beyond = goal - place, end + slope * height - goal
+        if way * beyond <= 0:
+            return load, place
+        return load * (1 + way / beyond), goal
 
     @property
     def _needed(self) -> Floats:
@@ -195,27 +208,25 @@ def _reach(supports: Sequence[_Support]) -> _Reach:
     return min(supports)[0], max(high for _, high, _ in supports), supports
 
 
-def _firm(centre: float, supports: Sequence[_Support], firm: Sequence[_Reach | None]) -> _Reach | None:
-    """Find the parts of a block's supports between which it holds whatever comes to lie; None if it is not firm.
+def _is_within(place: float, reach: _Reach) -> bool:
+    return reach[0] - _CLOSE <= place <= reach[1] + _CLOSE
+
+
+def _firm_parts(supports: Sequence[_Support], firm: Sequence[_Reach | None]) -> _Reach | None:
+    """Find the parts of a block's supports that bear whatever comes; None if no support does.
 
     Args:
-        centre: Where the block's own weight lies.
         supports: What it stands on.
-        firm: The same of each block below.
+        firm: The same of each block below, None for those that are not firm: they need not bear anything.
     """
     parts = []
     for low, high, by in supports:
-        if by >= 0:
-            below = firm[by]
-            if below is None:
-                continue  # it need not bear anything
+        below = firm[by] if by >= 0 else (-np.inf, np.inf, ())
+        if below is not None:
             low, high = max(low, below[0]), min(high, below[1])
-        if low <= high:
-            parts.append((low, high, by))
-    if not parts:
-        return None
-    reach = _reach(parts)
-    return reach if reach[0] - _CLOSE <= centre <= reach[1] + _CLOSE else None
+            if low <= high:
+                parts.append((low, high, by))
+    return _reach(parts) if parts else None
 
 
 def _shares(place: float, reach: _Reach, centres: Sequence[float]) -> list[tuple[float, float, int]]:
