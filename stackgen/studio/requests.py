@@ -133,6 +133,16 @@ class PushRequest(StackRequest):
 
 
 class ExportRequest(StackRequest):
-    """A stack as a file: for 3-D programs, as a picture, or as a film of how it settles."""
+    """A stack as a file: for 3-D programs, or as a film of how it settles."""
 
-    format: Literal["glb", "png", "mp4"]
+    format: Literal["glb", "mp4"]
+
+
+class ArmRequest(Request):
+    """The arm that builds.
+
+    Args:
+        cell_size: Edge of a cube [m]; lengths in the answer are in cells.
+    """
+
+    cell_size: float = Field(default=0.05, ge=0.001, le=10, allow_inf_nan=False)

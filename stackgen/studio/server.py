@@ -5,6 +5,7 @@ Endpoints only check what they are sent and hand the work to other processes (:m
 
 from __future__ import annotations
 
+import json
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -12,23 +13,27 @@ from functools import cache
 from importlib.resources import files
 from typing import Annotated, Any
 
-from fastapi import Depends, FastAPI, Header, Request, Response
+from fastapi import Depends, FastAPI, Header, Path, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.middleware import Middleware
 from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 
-from stackgen.errors import printable
+from stackgen.errors import StackgenError, printable
 from stackgen.studio.answers import Form, WorkResponse
+from stackgen.studio.gallery import Gallery
 from stackgen.studio.guard import Guard, refusal
-from stackgen.studio.methods import methods
+from stackgen.studio.reference import reference_page
 from stackgen.studio.requests import (
+    ArmRequest,
+    ExportRequest,
     GenerateRequest,
     PushRequest,
     ReadRequest,
     StackRequest,
     TiltRequest,
 )
+from stackgen.studio.work.methods import methods
 from stackgen.studio.workers import Workers
 from stackgen.viz.scene import shape_meshes
 from stackgen.world import PAPER_WORLD
@@ -58,11 +63,12 @@ _REFUSALS: dict[int | str, dict[str, Any]] = {
 }
 
 
-def make_app(workers: Workers, hosts: Iterable[str] = LOOPBACK) -> FastAPI:
+def make_app(workers: Workers, gallery: Gallery, hosts: Iterable[str] = LOOPBACK) -> FastAPI:
     """Make the application.
 
     Args:
         workers: Processes that do the work; they are closed with the application.
+        gallery: Results that it shows.
         hosts: Names by which it is reached.
     """
 
@@ -83,6 +89,7 @@ def make_app(workers: Workers, hosts: Iterable[str] = LOOPBACK) -> FastAPI:
     app.add_exception_handler(RequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _not_there)
     _add_page(app)
+    _add_gallery(app, gallery)
     for work in WORK:
         app.post(f"/api/{work.task}", summary=work.told, response_class=WorkResponse, responses=_REFUSALS)(
             _endpoint(workers, work)
@@ -97,14 +104,33 @@ def _add_page(app: FastAPI) -> None:
     for path, (name, media) in _PAGE.items():
         app.add_api_route(f"/{path}", serve(name, media), include_in_schema=False)
 
-    @app.get("/api/start")
+    @app.get("/api", include_in_schema=False)
+    def reference() -> Response:
+        return Response(reference_page(app.openapi()), media_type="text/html")
+
+    @app.get("/api/start", summary="List the methods, and describe the shapes of the blocks.")
     def start() -> dict[str, Any]:
-        """List the methods, and describe the shapes of the blocks."""
         return {
             "methods": methods(),
             "shapes": shape_meshes(PAPER_WORLD.catalogue),
             "most_blocks": PAPER_WORLD.max_blocks,
         }
+
+
+def _add_gallery(app: FastAPI, gallery: Gallery) -> None:
+    @app.get("/api/gallery", summary="List the results on this machine: stacks files, pictures and tables.")
+    def listing() -> list[dict[str, str]]:
+        return [item.to_json() for item in gallery.items()]
+
+    @app.get("/api/gallery/{item}", summary="Read a result that was listed.", responses=_REFUSALS)
+    def content(item: Annotated[str, Path(pattern="^[0-9a-f]{16}$")]) -> Response:
+        try:
+            found = gallery.content(item)
+        except StackgenError as error:
+            return refusal(404, printable(error))
+        if isinstance(found, bytes):
+            return Response(found, media_type="image/png")
+        return Response(json.dumps(found), media_type="application/json")
 
 
 @dataclass(frozen=True)
@@ -132,6 +158,10 @@ WORK = (
     Work("check", StackRequest, "Simulate a stack, and say whether it stands and why."),
     Work("tilt", TiltRequest, "Simulate a stack on a tilted table."),
     Work("push", PushRequest, "Simulate a stack one block of which is pushed."),
+    Work("order", StackRequest, "Find the order in which a stack can be built."),
+    Work("build", StackRequest, "Have the simulated arm build a stack; the answer has a message a line.", "lines"),
+    Work("arm", ArmRequest, "Describe the arm: its links, joints and meshes."),
+    Work("export", ExportRequest, "Make a file of a stack: GLB or MP4.", "file"),
 )
 
 

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable
+from pathlib import Path
 
 import uvicorn
 
 from stackgen.errors import StackgenError
+from stackgen.studio.gallery import Gallery
 from stackgen.studio.server import LOOPBACK, make_app
 from stackgen.studio.workers import Workers
 
 
-def serve(host: str, port: int, workers: int, ready: Callable[[str], None]) -> None:
+def serve(host: str, port: int, workers: int, gallery: Path, ready: Callable[[str], None]) -> None:
     """Serve the studio.
 
     Args:
         host: Address to listen at.
         port: Port; 0 for any that is free.
         workers: Number of processes that work.
+        gallery: Folder whose results are shown.
         ready: Called with the address once it can be opened.
 
     Raises:
@@ -26,7 +29,7 @@ def serve(host: str, port: int, workers: int, ready: Callable[[str], None]) -> N
     """
     listening = _listen(host, port)
     shown = f"[{host}]" if ":" in host else host
-    app = make_app(Workers(workers), (*LOOPBACK, host))
+    app = make_app(Workers(workers), Gallery(gallery), (*LOOPBACK, host))
     config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=1, ws="none")
     ready(f"http://{shown}:{listening.getsockname()[1]}/")
     uvicorn.Server(config).run(sockets=[listening])

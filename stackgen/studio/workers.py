@@ -48,7 +48,7 @@ class Workers:
 
     def __init__(self, number: int) -> None:
         self._context = multiprocessing.get_context("forkserver")
-        self._context.set_forkserver_preload(["stackgen.studio.tasks"])
+        self._context.set_forkserver_preload(["stackgen.studio.work.tasks"])
         self._waiting: OrderedDict[str, deque[asyncio.Future[_Process]]] = OrderedDict()
         self._threads = ThreadPoolExecutor(number + 2, "studio")
         self._number, self._closed = number, False
@@ -184,7 +184,7 @@ def _serve(pipe: Connection) -> None:
     """Work until nobody asks any more."""
     import torch
 
-    from stackgen.studio.tasks import TASKS, warm_up
+    from stackgen.studio.work.tasks import TASKS, warm_up
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this
     torch.set_num_threads(1)

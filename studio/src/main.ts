@@ -4,6 +4,7 @@ import { get, told } from "./api";
 import { byId, el } from "./dom";
 import { preset } from "./draw/presets";
 import { Sketchpad } from "./draw/sketchpad";
+import { Gallery } from "./gallery";
 import { linkTo, recall, remember } from "./memory";
 import { Pictures } from "./pictures";
 import { DEFAULTS, SettingsForm } from "./settings";
@@ -55,6 +56,21 @@ async function begin(): Promise<void> {
     await navigator.clipboard?.writeText(link).catch(() => undefined);
     byId("link-told").textContent = "The link is in the address bar, and copied.";
   });
+  const gallery = new Gallery((title, file, stacks, shapes) => {
+    turn("studio");
+    panes[1]!.element.hidden = true;
+    byId("panes").classList.remove("two");
+    panes[0]!.open(title, file, stacks, shapes);
+  });
+  const turn = (to: "studio" | "gallery") => {
+    for (const name of ["studio", "gallery"]) {
+      byId(name).hidden = name !== to;
+      byId(`to-${name}`).setAttribute("aria-pressed", String(name === to));
+    }
+    if (to === "gallery") void gallery.show();
+  };
+  byId("to-studio").addEventListener("click", () => turn("studio"));
+  byId("to-gallery").addEventListener("click", () => turn("gallery"));
   themes(() => {
     pad.paint();
     panes.forEach((pane) => pane.stage.world.colour());

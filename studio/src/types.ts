@@ -26,6 +26,7 @@ export interface Start {
 export interface Clip {
   frames: Pose[][];
   rate: number; // frames in a second
+  joints?: number[][]; // of the arm, in each frame
 }
 
 export interface Rollout extends Clip {

@@ -14,6 +14,7 @@ from stackgen.errors import StackgenError, require
 from stackgen.io.files import require_folder, write_atomically
 from stackgen.robot.simulated.arm import SimulatedArm
 from stackgen.sim.bullet_engine import bullet
+from stackgen.viz.film import Mp4
 from stackgen.viz.render import save_image
 
 Picture = NDArray[np.uint8]
@@ -115,28 +116,17 @@ class _Writer:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._av: Any = None if path.suffix.lower() == ".gif" else require("av", "film")
-        self._content = io.BytesIO()
-        self._mp4: Any = None
+        self._mp4 = None if path.suffix.lower() == ".gif" else Mp4(FRAMES)
         self._gif: list[Any] = []
 
     def add(self, frame: Picture) -> None:
         """Add a frame (H, W, 3); H and W are even for an MP4."""
-        if self._av is None:
-            from PIL import Image
-
-            self._gif.append(Image.fromarray(frame).quantize(64))
+        if self._mp4 is not None:
+            self._mp4.add(frame)
             return
-        if self._mp4 is None:
-            self._mp4 = self._av.open(self._content, "w", format="mp4")
-            stream = self._mp4.add_stream("libx264", FRAMES)  # what browsers play
-            stream.height, stream.width = frame.shape[:2]
-            stream.pix_fmt = "yuv420p"
-        self._encode(self._av.VideoFrame.from_ndarray(frame, format="rgb24"))
+        from PIL import Image
 
-    def _encode(self, frame: Any) -> None:
-        """Encode a frame, or with None what is still held back."""
-        self._mp4.mux(self._mp4.streams.video[0].encode(frame))
+        self._gif.append(Image.fromarray(frame).quantize(64))
 
     def finish(self) -> None:
         """Write the film.
@@ -144,11 +134,10 @@ class _Writer:
         Raises:
             StackgenError: If it cannot be written.
         """
-        if self._mp4 is not None:
-            self._encode(None)
-            self._mp4.close()
-        else:
-            first, *others = self._gif
-            duration = round(1000 / FRAMES)
-            first.save(self._content, format="GIF", save_all=True, append_images=others, duration=duration, loop=0)
-        write_atomically(self.path, self._content.getvalue())
+        write_atomically(self.path, self._gif_bytes() if self._mp4 is None else self._mp4.finish())
+
+    def _gif_bytes(self) -> bytes:
+        content, (first, *others) = io.BytesIO(), self._gif
+        duration = round(1000 / FRAMES)
+        first.save(content, format="GIF", save_all=True, append_images=others, duration=duration, loop=0)
+        return content.getvalue()

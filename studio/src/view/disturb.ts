@@ -4,8 +4,8 @@ import { post, told } from "../api";
 import { choice, el, labelled } from "../dom";
 import type { Rollout, StackFacts, StacksFile } from "../types";
 import { arrow } from "./marks";
-import { number } from "./why";
 import type { Stage } from "./stage";
+import { number } from "./why";
 
 const DIRECTIONS: [string, string][] = [["0", "to the right"], ["180", "to the left"], ["-90", "to the front"], ["90", "to the back"]];
 const MOST_TILT = 45; // [degrees]
@@ -61,6 +61,7 @@ export class Disturbances {
     this.tiltSlider.value = this.pushSlider.value = "0";
     this.tiltValue.textContent = this.pushValue.textContent = this.answer.textContent = "";
     this.stage.world.tilt(0, 0);
+    this.stage.setMarks(null);
   }
 
   /** Chooses the block to push. */
@@ -117,6 +118,7 @@ export class Disturbances {
       const rollout = await post<Rollout>(`/api/${what}`, { file: this.file, stack: this.place, ...how }, asked.signal);
       this.answer.textContent = say(rollout.stable);
       this.answer.className = `answer ${rollout.stable ? "stands" : "falls"}`;
+      this.stage.say(what === "tilt" ? "tilted" : "pushed", "busy");
       await this.stage.playRollout(rollout);
     } catch (error) {
       if (!asked.signal.aborted) this.answer.textContent = told(error);

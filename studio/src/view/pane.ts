@@ -2,7 +2,8 @@
 
 import { isAbort, messages, told } from "../api";
 import { button, el, labelled } from "../dom";
-import type { Message, Method, Pose, Start, StackFacts, StacksFile, Wish } from "../types";
+import type { Message, Method, Pose, Shape, Start, StackFacts, StacksFile, Wish } from "../types";
+import { Building } from "./build";
 import { Disturbances } from "./disturb";
 import { downloads } from "./downloads";
 import { explain } from "./marks";
@@ -10,6 +11,7 @@ import { overlays } from "./overlays";
 import { Stage } from "./stage";
 import { why } from "./why";
 
+const EXPLAINED_AFTER = 1500; // [ms] after a fall
 const NOISE_RATE = 14; // frames of denoising in a second
 
 export class Pane {
@@ -20,20 +22,24 @@ export class Pane {
   private readonly tabs = el("div", { class: "tabs", role: "tablist", "aria-label": "Structures" });
   private readonly facts = el("div", { class: "facts" });
   private readonly disturbances: Disturbances;
+  private readonly building: Building;
   private readonly tools: HTMLElement;
   private readonly weights = el("input", { type: "checkbox", change: () => this.markWeights() });
   private stacks: StackFacts[] = [];
   private file: Extract<Message, { kind: "file" }> | null = null;
   private shown = 0;
+  private shapes: Shape[];
   private running: AbortController | null = null;
 
   constructor(
     private readonly start: Start,
-    private readonly number: number,
+    number: number,
     private readonly onBlocks: (counts: Record<string, number>) => void,
   ) {
     this.stage = new Stage(start.shapes, `Structure ${number}`);
+    this.shapes = start.shapes;
     this.disturbances = new Disturbances(this.stage);
+    this.building = new Building(this.stage);
     this.stage.world.onPick = (block) => this.disturbances.choose(block);
     const explosion = el("input", { type: "range", min: 0, max: 1.5, step: 0.01, value: 0, "aria-label": "Explode" });
     explosion.addEventListener("input", () => this.stage.world.explode(Number(explosion.value)));
@@ -44,6 +50,7 @@ export class Pane {
       { class: "tools", hidden: true },
       el("div", { class: "row" }, again, home, labelled("Explode", explosion), el("label", { class: "check" }, this.weights, "Show weights")),
       this.disturbances.element,
+      this.building.element,
     );
     this.element = el(
       "section",
@@ -60,6 +67,7 @@ export class Pane {
   async run(method: Method, drawing: { cells: number; bits: string }, wish: Wish): Promise<void> {
     this.cancel();
     const running = (this.running = new AbortController());
+    this.use(this.start.shapes);
     this.clear(method);
     const began = performance.now();
     let frames: Pose[][] = [];
@@ -103,12 +111,18 @@ export class Pane {
   }
 
   /** Shows a file that was made before. */
-  open(title: string, file: StacksFile, stacks: StackFacts[]): void {
+  open(title: string, file: StacksFile, stacks: StackFacts[], shapes: Shape[]): void {
     this.cancel();
+    this.use(shapes);
     this.clear({ name: "", title, steps: null });
     this.take({ kind: "file", file, command: "", picture: "", notes: [] }, null);
     for (const [number, stack] of stacks.entries()) this.add({ kind: "stack", number, ...stack });
     this.choose(0);
+  }
+
+  private use(shapes: Shape[]): void {
+    this.shapes = shapes;
+    this.stage.world.setShapes(shapes);
   }
 
   private clear(method: Method): void {
@@ -119,6 +133,7 @@ export class Pane {
     this.state.textContent = "";
     this.stage.say("asking …", "busy");
     this.disturbances.reset();
+    this.building.reset();
     this.tabs.replaceChildren();
     this.facts.replaceChildren();
     delete this.element.dataset.done;
@@ -153,10 +168,11 @@ export class Pane {
     const size = this.file.file.grid.image_size;
     this.facts.replaceChildren(
       ...this.file.notes.map((note) => el("p", { class: "note" }, note)),
-      el("div", { class: "columns" }, why(stack, this.start.shapes), ...(stack.views ? [overlays(stack.views, size)] : [])),
+      el("div", { class: "columns" }, why(stack, this.shapes), ...(stack.views ? [overlays(stack.views, size)] : [])),
       downloads(this.file, number, this.stage.world),
     );
-    this.disturbances.take(this.file.file, number, stack, this.start.shapes.map((shape) => shape.name));
+    this.building.take(this.file.file, number, stack);
+    this.disturbances.take(this.file.file, number, stack, this.shapes.map((shape) => shape.name));
     this.tools.hidden = false;
   }
 
@@ -166,6 +182,7 @@ export class Pane {
     if (!stack) return;
     this.stage.present(stack.shapes, stack.frames[0]!);
     this.disturbances.reset();
+    this.building.reset();
     if (drop) void this.drop();
     else this.stage.world.pose(stack.frames.at(-1)!);
   }
@@ -174,10 +191,13 @@ export class Pane {
   private async drop(): Promise<void> {
     const stack = this.stacks[this.shown]!;
     this.disturbances.reset();
+    this.building.reset();
     this.stage.say("gravity on", "busy");
     await this.stage.playRollout(stack);
-    this.markWeights();
     this.element.dataset.done = "";
+    if (stack.stable && !this.weights.checked) return;
+    await new Promise((resolve) => setTimeout(resolve, stack.stable ? 0 : EXPLAINED_AFTER));
+    if (stack === this.stacks[this.shown] && !this.stage.player.playing) this.markWeights();
   }
 
   private markWeights(): void {
@@ -187,6 +207,6 @@ export class Pane {
     if (marked) this.stage.still();
     if (marked && stack.first !== null) this.stage.world.mark([stack.first]);
     this.stage.setMarks(marked ? explain(stack.statics) : null);
-    if (this.number) this.stage.say(stack.stable ? "stands" : "falls", stack.stable ? "stands" : "falls");
+    this.stage.say(stack.stable ? "stands" : "falls", stack.stable ? "stands" : "falls");
   }
 }

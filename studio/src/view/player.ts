@@ -7,6 +7,7 @@ export class Player {
   time = 0; // [s]
   speed = 1;
   playing = false;
+  pose: (joints: number[]) => void = () => {}; // the arm
   private waiting = false; // for frames that are still to come
   private ended: () => void = () => {};
 
@@ -67,7 +68,9 @@ export class Player {
     if (!frames.length) return;
     const place = Math.min(frames.length - 1, this.time * rate);
     const [from, to] = [frames[Math.floor(place)]!, frames[Math.ceil(place)]!];
-    this.show(from === to ? from : from.map((pose, i) => between(pose, to[i]!, place % 1)));
+    this.show(from === to ? from : from.map((pose, i) => (pose === to[i] ? pose : between(pose, to[i]!, place % 1))));
+    const [before, after] = [this.clip.joints?.[Math.floor(place)], this.clip.joints?.[Math.ceil(place)]];
+    if (before && after) this.pose(before.map((angle, i) => angle + (after[i]! - angle) * (place % 1)));
     this.moved(this);
   }
 }

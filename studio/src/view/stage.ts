@@ -14,7 +14,7 @@ export class Stage {
   readonly player: Player;
   private readonly badge = el("p", { class: "badge", role: "status" });
   private readonly seekBar = el("input", { type: "range", min: 0, max: 1, step: 0.001, value: 0, "aria-label": "Moment" });
-  private readonly playButton = button("▶", () => this.player.toggle(), { "aria-label": "Play or pause", disabled: true });
+  private readonly playButton = button("Play", () => this.player.toggle(), { disabled: true });
   private marks: three.Object3D | null = null;
 
   constructor(shapes: Shape[], name: string) {
@@ -86,6 +86,6 @@ export class Stage {
   private moved(): void {
     const { time, duration, playing } = this.player;
     this.seekBar.value = String(duration ? time / duration : 0);
-    this.playButton.textContent = playing ? "⏸" : "▶";
+    this.playButton.textContent = playing ? "Pause" : "Play";
   }
 }

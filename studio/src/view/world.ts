@@ -16,7 +16,7 @@ export class World {
   private readonly scene = new three.Scene();
   private readonly camera = new three.PerspectiveCamera(35, 1, 0.1, 300);
   private readonly controls: OrbitControls;
-  private readonly meshes: { body: three.BufferGeometry; edges: three.BufferGeometry; colour: three.Color }[];
+  private meshes: { body: three.BufferGeometry; edges: three.BufferGeometry; colour: three.Color }[] = [];
   private blocks: three.Group[] = [];
   private poses: Pose[] = [];
   private explosion = 0;
@@ -31,7 +31,7 @@ export class World {
     this.canvas = this.renderer.domElement;
     this.canvas.setAttribute("role", "img");
     this.canvas.tabIndex = 0;
-    this.meshes = shapes.map(meshOf);
+    this.setShapes(shapes);
     this.camera.up.set(0, 0, 1);
     this.controls = new OrbitControls(this.camera, this.canvas);
     this.controls.addEventListener("change", () => this.paint());
@@ -47,6 +47,11 @@ export class World {
     new ResizeObserver(() => this.resize()).observe(this.canvas);
     this.canvas.addEventListener("click", (event) => this.pick(event));
     this.colour();
+  }
+
+  /** Takes the shapes that blocks are of from now on. */
+  setShapes(shapes: Shape[]): void {
+    this.meshes = shapes.map(meshOf);
   }
 
   /** Shows blocks of these shapes, all at the origin until they are posed. */
@@ -112,7 +117,7 @@ export class World {
     const size = Math.max(width, height, 2);
     this.controls.target.set(0, 0, height * 0.45);
     const aspect = Math.min(1, this.camera.aspect);
-    this.camera.position.set(0.75, -2.0, 0.75).multiplyScalar((size * 1.05) / Math.sqrt(aspect)).add(this.controls.target);
+    this.camera.position.set(0.75, -2.0, 0.75).multiplyScalar((size * 1.2) / Math.sqrt(aspect)).add(this.controls.target);
     this.controls.update();
     this.paint();
   }

@@ -21,8 +21,8 @@ from stackgen.sim.physics import Physics
 from stackgen.sim.simulator import Rollout, Simulator
 from stackgen.sim.statics.checker import StaticsChecker
 from stackgen.stack import Stack
-from stackgen.studio.drawings import views
 from stackgen.studio.requests import MOST_BLOCKS, PushRequest, StackRequest, TiltRequest
+from stackgen.studio.work.drawings import views
 from stackgen.viz.scene import quaternion_poses
 
 Message = dict[str, Any]

@@ -24,10 +24,10 @@ from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.protocols import StackSampler
 from stackgen.sampling.verified import Budget
 from stackgen.stack import shapes_of
-from stackgen.studio.drawings import cells_high, mask_of, pack, picture_of, png
-from stackgen.studio.judging import Message, Recorder, entry_facts, physics_of
-from stackgen.studio.methods import BEST, methods
 from stackgen.studio.requests import GenerateRequest, ReadRequest, Wish
+from stackgen.studio.work.drawings import cells_high, mask_of, pack, picture_of, png
+from stackgen.studio.work.judging import Message, Recorder, entry_facts, physics_of
+from stackgen.studio.work.methods import BEST, methods
 from stackgen.vision.drawings import grid_offset
 from stackgen.vision.reader import Reading, read_picture
 from stackgen.viz.scene import quaternion_poses

@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from stackgen.models.weights import DEFAULTS
-from stackgen.studio.drawings import pack
-from stackgen.studio.generating import generate, read
-from stackgen.studio.judging import checked, pushed, tilted
-from stackgen.studio.methods import BEST
 from stackgen.studio.requests import CELL, Drawing, GenerateRequest, Wish
+from stackgen.studio.work.building import built, described, ordered
+from stackgen.studio.work.drawings import pack
+from stackgen.studio.work.exporting import exported
+from stackgen.studio.work.generating import generate, read
+from stackgen.studio.work.judging import checked, pushed, tilted
+from stackgen.studio.work.methods import BEST
 
 TASKS: dict[str, Callable[[Any, Callable[[dict[str, Any]], None]], None]] = {
     "generate": generate,
@@ -20,6 +22,10 @@ TASKS: dict[str, Callable[[Any, Callable[[dict[str, Any]], None]], None]] = {
     "check": checked,
     "tilt": tilted,
     "push": pushed,
+    "order": ordered,
+    "build": built,
+    "arm": described,
+    "export": exported,
 }
 """Functions of a request and of what takes their messages, the last of which is the answer."""
 
