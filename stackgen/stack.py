@@ -59,6 +59,12 @@ class Stack:
         """(S,) block list of the stack: how many of each shape."""
         return np.bincount(self.shapes, minlength=len(self.catalogue))
 
+    def _repr_html_(self) -> str:
+        """Show the stack in a notebook, as a view that turns."""
+        from stackgen.viz.page import notebook_html
+
+        return notebook_html([self])
+
     def with_poses(self, poses: ArrayLike) -> Stack:
         """The same blocks at other poses."""
         return Stack(self.shapes, np.asarray(poses, dtype=np.float64), self.catalogue)

@@ -110,6 +110,12 @@ class StacksFile:
         """The stacks without what is known about them."""
         return [entry.stack for entry in self.entries]
 
+    def _repr_html_(self) -> str:
+        """Show the stacks in a notebook, as a view that turns, with their verdicts."""
+        from stackgen.viz.page import notebook_html
+
+        return notebook_html(self.stacks, [entry.verdict for entry in self.entries], self.silhouette or "Stacks")
+
 
 def read_stacks(path: str | Path) -> StacksFile:
     """Read and check a stacks file; `-` is standard input.

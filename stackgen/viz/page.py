@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from html import escape
 from pathlib import Path
 
 from stackgen.errors import StackgenError
@@ -13,6 +14,7 @@ from stackgen.stack import Stack
 from stackgen.viz.scene import scene
 
 _VIEWER = Path(__file__).with_name("viewer.html")
+_FRAME = "width: 100%; height: 420px; border: 1px solid #d5d9e1; border-radius: 8px"
 
 
 def write_html(
@@ -42,3 +44,13 @@ def html_page(stacks: Sequence[Stack], verdicts: Sequence[Verdict | None] | None
     data = {"title": title, **scene(stacks, known)}
     safe = json.dumps(data, allow_nan=False).replace("<", "\\u003c")  # nothing in it can end the script
     return _VIEWER.read_text(encoding="utf-8").replace("/*DATA*/null", safe)
+
+
+def notebook_html(
+    stacks: Sequence[Stack], verdicts: Sequence[Verdict | None] | None = None, title: str = "Stack"
+) -> str:
+    """Make a frame for a notebook that holds the page of some stacks; a sentence where there are none."""
+    if not stacks:
+        return "<p>There are no stacks.</p>"
+    page = escape(html_page(stacks, verdicts, title), quote=True)
+    return f'<iframe srcdoc="{page}" title="{escape(title)}" sandbox="allow-scripts" style="{_FRAME}"></iframe>'

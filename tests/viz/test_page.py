@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import re
+from html import unescape
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from stackgen.errors import StackgenError
+from stackgen.io.stacks_file import StackEntry, StacksFile
 from stackgen.protocols import Verdict
 from stackgen.stack import Stack
 from stackgen.viz.page import html_page, write_html
-from stackgen.world import PAPER_CATALOGUE, Catalogue, Shape
+from stackgen.world import PAPER_CATALOGUE, PAPER_WORLD, Catalogue, Shape
 
 STACK = Stack(np.array([3, 0, 2, 0, 1]), np.random.default_rng(0).normal(size=(5, 6)))
 FALLS = Verdict(False, np.arange(5) == 1, np.linspace(0, 1, 5), STACK.with_poses(STACK.poses + 1))
@@ -78,3 +80,11 @@ def test_stacks_that_do_not_fit_together_are_refused() -> None:
     for arguments in ([], [STACK, other]):
         with pytest.raises(StackgenError, match="one catalogue"):
             html_page(arguments)
+
+
+def test_stacks_and_files_show_themselves_in_notebooks() -> None:
+    for shown in (STACK, StacksFile((StackEntry(STACK, FALLS),), PAPER_WORLD, silhouette='"><script>')):
+        frame = re.fullmatch(r'<iframe srcdoc="([^"]*)"[^<>]*></iframe>', shown._repr_html_())
+        assert frame
+        assert page_data(unescape(frame.group(1)))["stacks"][0]["shapes"] == STACK.shapes.tolist()
+    assert "no stacks" in StacksFile((), PAPER_WORLD)._repr_html_()
