@@ -14,6 +14,10 @@ class StackgenError(Exception):
     """
 
 
+MALFORMED = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError)
+"""What plain data of another form than was expected raises where it is taken apart."""
+
+
 class Terminated(KeyboardInterrupt):
     """The system asked this process to end (SIGTERM); whatever answers Ctrl-C answers it, too."""
 

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.errors import StackgenError
+from stackgen.errors import MALFORMED, StackgenError
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -214,7 +214,7 @@ class Catalogue:
         """
         try:
             return Catalogue(tuple(_prism(str(item["name"]), item) for item in items))
-        except (KeyError, TypeError, ValueError) as error:
+        except MALFORMED as error:
             raise StackgenError(
                 f'a catalogue is a list of {{"name", "outline": [[x, z], ...], "depth"}}: {error!r}'
             ) from error
@@ -254,7 +254,7 @@ def _shape_from_config(item: str | Mapping) -> Shape:
                 raise StackgenError(f"shape {name!r}: width, height and depth must be positive and finite")
             return Shape.box(name, *extents)
         return _prism(name, item)
-    except (TypeError, ValueError) as error:
+    except MALFORMED as error:
         raise StackgenError(f"shape {name!r}: extents are numbers, an outline [[x, z], ...]: {error}") from error
 
 
@@ -320,6 +320,8 @@ class Grid:
                 raise StackgenError(f"grid: {name} must be {kind}, got {value}")
             if value > _MOST[name]:
                 raise StackgenError(f"grid: {name} must be at most {_MOST[name]}, got {value}")
+            if whole:
+                object.__setattr__(self, name, int(value))  # 64.0 of a file is 64
         if not 0 <= self.ground_margin < self.image_size:
             raise StackgenError(f"grid: ground_margin must lie in 0..image_size, got {self.ground_margin}")
 
@@ -405,7 +407,7 @@ class World:
         try:
             grid, max_blocks = Grid(**facts["grid"]), int(facts["max_blocks"])
             return World(Catalogue.from_json(facts["catalogue"]), grid, max_blocks)
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
+        except MALFORMED as error:
             raise StackgenError(f"a world is a catalogue, a grid and max_blocks: {error!r}") from error
 
 

@@ -120,6 +120,10 @@ def test_a_bad_grid_or_template_is_one_line(cli: Cli, tmp_path: Path, options: l
 # The grid.
 
 
+def test_whole_numbers_of_a_file_may_have_a_point() -> None:
+    assert repr(Grid(4.0, 4, 64.0)) == repr(Grid(4, 4, 64))  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (4, 4), (6, 5), (5, 7), (12, 3)])
 def test_the_size_that_an_error_names_would_do(width: int, height: int) -> None:
     with pytest.raises(StackgenError) as caught:

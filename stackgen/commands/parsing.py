@@ -31,7 +31,7 @@ from stackgen.commands.cli import explain
 from stackgen.commands.hints import did_you_mean
 from stackgen.commands.old_names import renew
 from stackgen.commands.output import FORMS, chosen, telling
-from stackgen.errors import StackgenError
+from stackgen.errors import MALFORMED, StackgenError
 from stackgen.io.files import is_pipe
 from stackgen.io.text import parse_yaml, read_text, to_yaml
 
@@ -302,7 +302,7 @@ def blaming_values() -> Iterator[None]:
     """
     try:
         yield
-    except (TypeError, ValueError, AttributeError, OverflowError, LookupError) as error:
+    except MALFORMED as error:
         if explain(error) is not None:  # a line of its own
             raise
         raise StackgenError(f"the configuration cannot be used: {shorten(str(error))}") from error

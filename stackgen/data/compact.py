@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 from stackgen.data.arrays import FIELDS, StackArrays
 from stackgen.data.manifest import SPLITS, Manifest
 from stackgen.data.sources import read_bytes
-from stackgen.errors import StackgenError
+from stackgen.errors import MALFORMED, StackgenError
 from stackgen.io.arrays import read_npz
 from stackgen.io.files import write_atomically
 from stackgen.io.text import parse_json
@@ -60,7 +59,7 @@ def load_npz(path: str) -> tuple[dict[str, StackArrays], Manifest]:
         file = read_npz(read_bytes(path))
         fields = {name: file[name] for name in FIELDS}
         split, plain = file["split"], parse_json(str(file["manifest"]), path)
-    except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, *MALFORMED) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise StackgenError(f"{path} is not a compact stackgen dataset: {reason}") from error
     manifest = Manifest.from_json(plain, path)

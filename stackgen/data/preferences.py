@@ -8,7 +8,6 @@ Legend: P pairs, N blocks at most, n samples a scene.
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from stackgen.data.arrays import PADDING, StackArrays
 from stackgen.data.compact import write_npz
-from stackgen.errors import StackgenError
+from stackgen.errors import MALFORMED, StackgenError
 from stackgen.geometry import silhouette_iou
 from stackgen.io.arrays import read_npz
 from stackgen.io.files import read_bytes
@@ -76,7 +75,7 @@ class Preferences:
             )
         except FileNotFoundError as error:
             raise StackgenError(f"no preferences at {path}: make them with `stackgen prefer`") from error
-        except (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        except (OSError, *MALFORMED) as error:
             raise StackgenError(f"{path} is not a file of preferences: make one with `stackgen prefer`") from error
         return Preferences(better, worse)
 

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from stackgen.data.manifest import ShardEntry
 from stackgen.data.shards import compression_of
-from stackgen.errors import StackgenError
+from stackgen.errors import MALFORMED, StackgenError
 from stackgen.io.files import read_bytes as read_file
 
 PIPE = "pipe:"
@@ -100,7 +100,7 @@ class Shard:
     def __init__(self, root: str, entry: ShardEntry) -> None:
         try:
             self.name, self.sha256, self.samples = str(entry["file"]), str(entry["sha256"]), int(entry["samples"])
-        except (KeyError, TypeError, ValueError) as error:
+        except MALFORMED as error:
             raise StackgenError(f"dataset {root}: dataset.json is damaged: shard {entry!r:.80}") from error
         self.path = locate(root, self.name)
 

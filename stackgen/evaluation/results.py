@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from stackgen.errors import StackgenError
+from stackgen.errors import MALFORMED, StackgenError
 from stackgen.evaluation.intervals import Estimate, clustered_percentile, clustered_ratio
 from stackgen.evaluation.metrics import DEPTHS, METRICS, SampleScore, SceneScore, in_both
 from stackgen.io.files import write_atomically, write_json
@@ -211,7 +211,7 @@ def read_evaluation(path: Path) -> tuple[Evaluation, Question]:
         return Evaluation(scenes=scenes, **row["kept"]), row["question"]
     except OSError as error:
         raise StackgenError(f"{path} cannot be read: {error.strerror or error}") from error
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except MALFORMED as error:
         raise StackgenError(f"{path} is damaged or no evaluation: remove it") from error
 
 

@@ -48,9 +48,13 @@ def read_npz(content: bytes) -> dict[str, NDArray[Any]]:
     """Read a `.npz` file from its bytes.
 
     Raises:
-        ValueError, zipfile.BadZipFile: If it is none, is packed beyond belief, or holds anything but plain arrays.
+        ValueError: If it is none, is packed beyond belief, or holds anything but plain arrays.
     """
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+    try:
+        archive = zipfile.ZipFile(io.BytesIO(content))
+    except (zipfile.BadZipFile, *_DAMAGED) as error:
+        raise ValueError(" ".join(str(error).split())) from error
+    with archive:
         size = sum(member.file_size for member in archive.infolist())
         if size > max(_LARGE, _RATIO * len(content)):
             raise ValueError(f"{size} bytes are packed into {len(content)}")

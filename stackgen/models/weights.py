@@ -20,7 +20,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from stackgen.errors import StackgenError
+from stackgen.errors import MALFORMED, StackgenError
 from stackgen.io.files import open_bytes, read_bytes, write_atomically, write_json
 from stackgen.io.text import read_json
 from stackgen.world import World
@@ -228,6 +228,6 @@ def build(weights: str | Path, card: dict[str, Any], tensors: dict[str, Tensor],
         world = World.from_json(card)
         network, wrap = maker(card["config"], world)
         network.load_state_dict(tensors)
-    except (StackgenError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (StackgenError, *MALFORMED, RuntimeError) as error:
         raise StackgenError(f"{weights}: card and weights do not fit together: {str(error).splitlines()[0]}") from error
     return wrap(network, world, card)

@@ -44,6 +44,9 @@ FOOT = 0.012
 PIXEL = 0.002
 """Edge of a pixel of the picture of the front [m]."""
 
+BEYOND = 10.0
+"""Size from which on a structure is not drawn: its picture would be larger than any that a camera takes [m]."""
+
 MEDIAN = 5
 """Size of the median filter on frame and front [pixel]: it smooths what depth noise does to edges."""
 
@@ -170,7 +173,7 @@ def find_structure(frame: DepthFrame) -> SeenStructure:
     picture, outline = _straight_on(frame, seen, holes, planes)
     front = largest(smoothed(picture, MEDIAN), round(JOINT / PIXEL))
     if not front.any():
-        raise StackgenError(f"what stands in front of the background is smaller than {1e3 * MEDIAN * PIXEL:g} mm")
+        raise StackgenError("the structure's points are too far apart to be a front: see --depth_scale and --focal")
     rows, columns = bounding_box(front)
     size = ((columns.stop - columns.start) * PIXEL, (rows.stop - rows.start) * PIXEL)
     whole = np.count_nonzero(seen)
@@ -329,6 +332,10 @@ def _straight_on(
     origin = middle + (1 - middle @ plane) / (plane @ normal) * normal
     x, y = (points - origin) @ right, (origin - points) @ up
     low, high = [np.quantile(values, [0.0005, 0.9995]) for values in (x, y)]
+    if max(np.ptp(low), np.ptp(high)) > BEYOND:
+        raise StackgenError(
+            f"the structure would be {np.ptp(low):.3g} x {np.ptp(high):.3g} m: see --depth_scale and --focal"
+        )
     border = 0.03
     columns = np.floor((x - low[0] + border) / PIXEL).astype(int)
     rows = np.floor((y - high[0] + border) / PIXEL).astype(int)

@@ -108,6 +108,12 @@ def test_the_background_alone_holds_nothing() -> None:
         find_structure(simulated_frame(empty))
 
 
+@pytest.mark.parametrize(("focal", "line"), [(1.0, r"would be .* m: see"), (30.0, "too far apart to be a front")])
+def test_a_wrong_focal_length_is_one_line_at_once(focal: float, line: str) -> None:
+    with pytest.raises(StackgenError, match=line):
+        find_structure(DepthFrame(simulated_frame(ARCH).depth, None, focal))
+
+
 def test_a_frame_without_depth_is_refused() -> None:
     with pytest.raises(StackgenError, match="the frame has no depth"):
         DepthFrame(np.zeros((480, 640)))

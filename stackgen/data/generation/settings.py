@@ -10,7 +10,7 @@ from typing import Any, Literal, get_type_hints
 from stackgen.data.generation.designs import DesignSettings
 from stackgen.data.generation.drawing.drawings import DrawingSettings
 from stackgen.data.manifest import Manifest, Split, split_of
-from stackgen.errors import StackgenError
+from stackgen.errors import MALFORMED, StackgenError
 from stackgen.sim.checkers import AcceptLimits
 from stackgen.sim.physics import Physics
 from stackgen.sim.statics.plane import StaticsMargins
@@ -118,7 +118,7 @@ class GenerateSettings:
         world = {"name": manifest.name, "seed": manifest.seed, **vars(manifest.world)}
         try:
             return _revived(GenerateSettings, {**plain, **world, "physics": physics})
-        except (KeyError, TypeError) as error:
+        except MALFORMED as error:
             raise StackgenError(
                 f"dataset {manifest.name!r} was not made by this version of `stackgen generate`: {error}"
             ) from error

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from stackgen.errors import StackgenError
+from stackgen.errors import MALFORMED, StackgenError
 from stackgen.evaluation.diversity_limit import expected_diversity
 from stackgen.evaluation.intervals import Estimate, clustered_ratio
 from stackgen.evaluation.metrics import valid_diversity
@@ -81,7 +81,7 @@ def read_diversity_limit(path: Path, test_set: str, physics: Mapping[str, Any]) 
         }
     except OSError as error:
         raise StackgenError(f"{path} cannot be read: {error.strerror or error}; {how}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except MALFORMED as error:
         raise StackgenError(f"{path} is damaged or another file; {how}") from error
     return DiversityLimit(layouts)
 
@@ -142,5 +142,5 @@ def read_unseen(test_set: str, training_sets: Sequence[str] | None = None, path:
         return Unseen(tuple(chosen), frozenset(str(known[name]["sha256"]) for name in chosen), scenes)
     except OSError as error:
         raise StackgenError(f"{path} cannot be read: {error.strerror or error}; {how}") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except MALFORMED as error:
         raise StackgenError(f"{path} is damaged or another file; {how}") from error

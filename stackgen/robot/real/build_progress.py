@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from stackgen.errors import StackgenError
+from stackgen.errors import MALFORMED, StackgenError
 from stackgen.io.files import write_json
 from stackgen.io.text import read_json
 from stackgen.robot.workcell import Workcell
@@ -77,7 +77,7 @@ class BuildProgress:
             )
             if sorted(found.order) != list(range(len(found.shapes))) or not 0 <= found.placed <= len(found.order):
                 raise ValueError("order")
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
+        except MALFORMED as error:
             raise StackgenError(f"{path}: is not the progress of a build ({FORMAT})") from error
         return found
 

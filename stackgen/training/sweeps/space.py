@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from stackgen.errors import StackgenError, require
+from stackgen.errors import MALFORMED, StackgenError, require
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
@@ -46,7 +46,7 @@ def space_of(parameters: Mapping[str, Parameter]) -> dict[str, BaseDistribution]
         if "value" not in given:
             try:
                 found[name] = _distribution(given)
-            except (ValueError, TypeError) as error:
+            except MALFORMED as error:
                 raise StackgenError(f"parameter {name}: {error}") from error
     if not found:
         raise StackgenError("a sweep needs a parameter with several values")

@@ -100,6 +100,14 @@ def test_a_damaged_evaluation_is_one_line(text: str, tmp_path: Path) -> None:
         read_evaluation(tmp_path / "e.json")
 
 
+def test_numbers_that_no_stack_has_are_damage(answered: Evaluation, tmp_path: Path) -> None:
+    write_evaluation(tmp_path / "e.json", answered, question())
+    text = (tmp_path / "e.json").read_text()
+    (tmp_path / "e.json").write_text(text.replace('"shapes": [[', f'"shapes": [[{10**20}, ', 1))
+    with pytest.raises(StackgenError, match=r"e\.json is damaged"):
+        read_evaluation(tmp_path / "e.json")
+
+
 @pytest.mark.parametrize(
     "changes",
     [
