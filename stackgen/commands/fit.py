@@ -46,6 +46,7 @@ from stackgen.training.callbacks import SampleQuality, StepMetrics, Throughput
 from stackgen.training.checkpoints import KeepOnStop, keep_whole
 from stackgen.training.divergence import StopIfDiverged
 from stackgen.training.loggers import CheckpointArtifact, Dashboard, log_configuration, loggers, require_dashboard
+from stackgen.training.monitors import CheckMonitors
 from stackgen.training.runs import RUNS, config_of, describe_run, drop_run_without, is_first_process, new_shared_run
 from stackgen.training.sweeps.telling import TellSweep, in_a_sweep
 
@@ -325,7 +326,7 @@ def _complete(callbacks: list[Callback], keep: bool) -> list[Callback]:
         keep: Whether any state is kept.
     """
     found = list(callbacks)
-    for kind in (StepMetrics, Throughput, CheckpointArtifact, StopIfDiverged, KeepOnStop):
+    for kind in (StepMetrics, Throughput, CheckpointArtifact, StopIfDiverged, KeepOnStop, CheckMonitors):
         if not any(isinstance(callback, kind) for callback in found):
             found.append(kind())
     if in_a_sweep():

@@ -39,8 +39,14 @@ def tiny(towers_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     ("options", "word"),
     [
         ("--trainer.max_steps -1 --trainer.max_time 00:00:00:05", "give max_steps or max_epochs"),
-        ("--trainer.callbacks+=EarlyStopping --trainer.callbacks.monitor typo", "typo"),
-        ("--trainer.callbacks+=ModelCheckpoint --trainer.callbacks.monitor typo --trainer.max_steps 9", "typo"),
+        (
+            "--trainer.callbacks+=EarlyStopping --trainer.callbacks.monitor typo",
+            "no metric is called 'typo'; there are",
+        ),
+        (
+            "--trainer.callbacks+=ModelCheckpoint --trainer.callbacks.monitor typo --trainer.max_steps 9",
+            "validation/loss",
+        ),
         ("--model.denoiser.width 97 --model.denoiser.heads 4", "multiple of heads (4), got 97"),
         ("--model.denoiser.width 0", "width must"),
         ("--model.denoiser.heads 0", "heads must"),
@@ -61,6 +67,15 @@ def test_a_refusal_of_a_library_is_one_line(options: str, word: str, cli: Cli, t
     assert answer.code == 2, answer.err
     last = answer.err.splitlines()[-1]
     assert last.startswith("stackgen fit: ") and word in last and "bug" not in last
+    assert not Path("runs").exists()
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("metric", ["validation/loss", "train/loss", "train/gradient_norm"])
+def test_metrics_that_are_logged_can_be_monitored(metric: str, cli: Cli, tiny: Path) -> None:
+    best = ["--trainer.callbacks+=ModelCheckpoint", "--trainer.callbacks.monitor", metric]
+    answer = cli("fit", "--config", tiny, "--dashboard", "none", *best)
+    assert answer.code == 0, answer.err
 
 
 def test_a_mistake_of_ours_is_still_a_bug() -> None:
