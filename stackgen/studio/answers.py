@@ -10,7 +10,7 @@ import base64
 import contextlib
 import json
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from typing import Literal
 
 from starlette.responses import Response
@@ -35,7 +35,7 @@ class WorkResponse(Response):
         form: Form in which they are sent.
     """
 
-    def __init__(self, messages: AsyncIterator[bytes], form: Form = "json") -> None:
+    def __init__(self, messages: AsyncGenerator[bytes, None], form: Form = "json") -> None:
         super().__init__()
         self.messages, self.form = messages, form
 
@@ -53,7 +53,7 @@ class WorkResponse(Response):
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
         begun = False
         try:
-            async with contextlib.aclosing(self.messages) as messages:  # type: ignore[type-var]
+            async with contextlib.aclosing(self.messages) as messages:
                 last = b"{}"
                 async for last in messages:
                     if self.form == "lines":

@@ -6,6 +6,7 @@ WebSocket. A page may load what the studio itself serves, and nothing else.
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Iterable
 from typing import Any
@@ -61,9 +62,10 @@ class Guard:
         if answer is not None:
             await answer(scope, receive, _with_headers(send))
             return
-        try:
-            await self.app(scope, _counted(receive), _with_headers(send))
-        except TooLarge:
+        body = _Body(receive)
+        with contextlib.suppress(TooLarge):
+            await self.app(scope, body.receive, _with_headers(body.unless_too_large(send)))
+        if body.too_large:
             await refusal(413, _TOO_LARGE)(scope, receive, _with_headers(send))
 
     def _refusal(self, headers: dict[bytes, bytes]) -> Response | None:
@@ -90,19 +92,33 @@ class Guard:
 _TOO_LARGE = f"the request is too large: at most {MOST_BYTES // 1_000_000} MB are taken, so scale the picture down"
 
 
-def _counted(receive: Receive) -> Receive:
-    """Receive a body, but no more than the limit, whatever its header says."""
-    received = 0
+class _Body:
+    """A body that is received up to the limit, whatever its header says."""
 
-    async def counted() -> Message:
-        nonlocal received
-        message = await receive()
-        received += len(message.get("body", b""))
-        if received > MOST_BYTES:
+    def __init__(self, receive: Receive) -> None:
+        self._receive, self._received = receive, 0
+
+    @property
+    def too_large(self) -> bool:
+        """Whether there was more than the limit."""
+        return self._received > MOST_BYTES
+
+    async def receive(self) -> Message:
+        """See ASGI."""
+        message = await self._receive()
+        self._received += len(message.get("body", b""))
+        if self.too_large:
             raise TooLarge
         return message
 
-    return counted
+    def unless_too_large(self, send: Send) -> Send:
+        """Send on what the application answers, unless it only answers that the body broke off."""
+
+        async def sending(message: Message) -> None:
+            if not self.too_large:
+                await send(message)
+
+        return sending
 
 
 def _with_headers(send: Send) -> Send:

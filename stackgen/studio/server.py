@@ -91,9 +91,8 @@ def make_app(workers: Workers, gallery: Gallery, hosts: Iterable[str] = LOOPBACK
     _add_page(app)
     _add_gallery(app, gallery)
     for work in WORK:
-        app.post(f"/api/{work.task}", summary=work.told, response_class=WorkResponse, responses=_REFUSALS)(
-            _endpoint(workers, work)
-        )
+        told: dict[str, Any] = {"summary": work.told, "responses": _REFUSALS, "status_code": 200}
+        app.post(f"/api/{work.task}", response_class=WorkResponse, **told)(_endpoint(workers, work))
     return app
 
 

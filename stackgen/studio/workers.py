@@ -11,7 +11,7 @@ import multiprocessing
 import signal
 import traceback
 from collections import OrderedDict, deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from typing import Any
@@ -71,7 +71,7 @@ class Workers:
             pass
         self._give(process)
 
-    async def work(self, client: str, task: str, request: BaseModel) -> AsyncIterator[bytes]:
+    async def work(self, client: str, task: str, request: BaseModel) -> AsyncGenerator[bytes, None]:
         """Do some work, and yield its messages as JSON; when the iterator is closed early, the work is killed.
 
         Raises:
@@ -157,7 +157,7 @@ class _Process:
         except OSError as error:
             raise Broken(f"the process was gone before it began: {error}") from error
 
-    async def answer(self) -> AsyncIterator[bytes]:
+    async def answer(self) -> AsyncGenerator[bytes, None]:
         """Yield the messages of the work as they come."""
         loop = asyncio.get_running_loop()
         while True:

@@ -271,3 +271,17 @@ def test_the_catalogue_s_other_shapes_are_simulated_too(physics: Physics) -> Non
         assert moved(simulator.rollout(stack)) < 0.03
         turned = Stack(np.array([1]), np.array([[0, 0, np.cos(np.pi / 8), 0, np.pi / 8, 0]]), catalogue)
         assert moved(simulator.rollout(turned)) < 0.03  # on one of its sides
+
+
+@pytest.mark.parametrize("share", [0.4, 0.6])
+def test_a_pull_slides_a_block_where_it_exceeds_friction_and_a_tilt_is_a_pull_on_all(
+    simulator: Simulator, share: float
+) -> None:
+    flat = Stack(np.array([2, 0]), np.array([[0, 0, 0.5, 0, 0, 0], [0, 5, 0.5, 0, 0, 0]]))  # too flat to tip
+    rollout = simulator.rollout(flat, pull=np.array([[share, 0, 0], [0, 0, 0]]))
+    moved = np.linalg.norm(rollout.end.poses[:, :3] - flat.poses[:, :3], axis=1)
+    assert (moved[0] > 0.5) == (share > simulator.physics.friction)
+    assert moved[1] < 0.01
+    angle = np.arctan(share)
+    tilted = simulator.rollout(flat, pull=np.tile([np.sin(angle), 0, 1 - np.cos(angle)], (2, 1)))
+    assert (np.abs(tilted.end.poses[0, 0]) > 0.5) == (share > simulator.physics.friction)
