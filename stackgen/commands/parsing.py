@@ -32,8 +32,8 @@ from stackgen.commands.hints import did_you_mean
 from stackgen.commands.old_names import renew
 from stackgen.commands.output import FORMS, chosen, telling
 from stackgen.errors import MALFORMED, StackgenError
-from stackgen.io.files import is_pipe
-from stackgen.io.text import parse_yaml, read_text, to_yaml
+from stackgen.io.files import is_endless
+from stackgen.io.text import parse_yaml, read_text, texts_in, to_yaml
 
 if TYPE_CHECKING:
     from stackgen.world import Catalogue
@@ -327,8 +327,8 @@ def own_sections(verb: str, argv: Sequence[str]) -> list[str]:
         StackgenError: If a file is no YAML in UTF-8, or holds no options, or any argument is a pipe.
     """
     for value in [part for argument in argv for part in (argument, argument.partition("=")[2])]:
-        if is_pipe(value):
-            raise StackgenError(f"{value} is a pipe or a socket; give a file")
+        if is_endless(value):
+            raise StackgenError(f"{value} is a pipe, a socket or a device; give a file")
     arguments = [renew(argument) for argument in argv]
     files: list[int] = []
     for index, value in option_values(arguments, CONFIG_FLAGS):
@@ -369,6 +369,9 @@ def _own_text(value: str, verb: str) -> str | None:
     content = parse_yaml(text, value)
     if not isinstance(content, dict):
         raise StackgenError(f"--config {value}: it holds no options, which are written as `name: value`")
+    for name in texts_in(content):  # which others may take for a file and wait for
+        if is_endless(name) or is_endless(str(Path(value).parent / name)):
+            raise StackgenError(f"--config {value}: {name} is a pipe, a socket or a device; give a file")
     section = content.get(verb)
     options = section if isinstance(section, dict) else content
     if options.get("config") is not None:

@@ -136,6 +136,7 @@ def staged(folder: Path, replaces: str) -> Iterator[Path]:
             folder.rmdir()
 
 
+_ENDLESS = ("/dev/zero", "/dev/full", "/dev/random", "/dev/urandom")
 _OWN_PIPES = ("/dev/fd/", "/dev/stdin", "/proc/self/fd/")
 """Where a shell puts what a command is given by `<(...)`."""
 
@@ -165,13 +166,14 @@ def read_bytes(path: str | Path) -> bytes:
         return file.read()
 
 
-def is_pipe(path: str) -> bool:
-    """Tell whether a path is a pipe or a socket, of which nobody knows when it ends; a shell's own do not count."""
+def is_endless(path: str) -> bool:
+    """Tell whether a path is a pipe, a socket or a device that may never end; a shell's own do not count."""
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError):  # ValueError: a NUL in the name
         return False
-    return (stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode)) and not path.startswith(_OWN_PIPES)
+    endless = stat.S_ISFIFO(mode) or stat.S_ISSOCK(mode) or os.path.realpath(path) in _ENDLESS
+    return endless and not path.startswith(_OWN_PIPES)
 
 
 def require_folder(folder: Path, asked: str) -> None:

@@ -10,6 +10,7 @@ import codecs
 import json
 import math
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -130,6 +131,14 @@ def _without_twins(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def to_yaml(content: Any) -> str:
     """Write YAML; text that a reader could take for a number, a date or a truth value is put in quotes."""
     return yaml.dump(content, Dumper=_Dumper, default_flow_style=False, allow_unicode=True, sort_keys=False)
+
+
+def texts_in(content: Any) -> Iterator[str]:
+    """Give every text among the values of plain data."""
+    if isinstance(content, str):
+        yield content
+    for value in content.values() if isinstance(content, dict) else content if isinstance(content, list) else ():
+        yield from texts_in(value)
 
 
 def in_markdown(text: object) -> str:

@@ -308,6 +308,15 @@ def test_a_pipe_is_not_waited_for(words: list[str], cli: Cli, tmp_path: Path) ->
     assert answer.code == 2 and str(pipe) in answer.line
 
 
+@pytest.mark.parametrize("name", ["pipe", "/dev/zero", "folder"])
+def test_a_pipe_that_a_file_of_options_names_is_not_waited_for_either(name: str, cli: Cli, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "x.yaml").write_text(f"name: x\nstacks: 4\nphysics: {name}\n")
+    answer = cli("generate", "--config", tmp_path / "x.yaml", "--out", tmp_path / "out")
+    assert answer.code == 2 and name in answer.line
+
+
 @pytest.mark.parametrize("content", ["config: {a: 1}", "config: other.yaml", "check: {config: {a: 1}}"])
 def test_a_file_of_options_names_no_other(content: str, cli: Cli, tmp_path: Path) -> None:
     (file := tmp_path / "c.yaml").write_text(content)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from stackgen.errors import StackgenError
-from stackgen.io.files import is_pipe, require_folder, staged, write_json
+from stackgen.io.files import is_endless, require_folder, staged, write_json
 
 
 def names(folder: Path) -> list[str]:
@@ -65,5 +65,7 @@ def test_a_device_is_written_to_and_not_replaced() -> None:
 def test_pipes_are_told_from_files(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "file").touch()
-    assert is_pipe(str(tmp_path / "pipe"))
-    assert not any(map(is_pipe, (str(tmp_path / "file"), str(tmp_path), "gone", "/dev/stdin", "/dev/null", "a\0b", "")))
+    assert is_endless(str(tmp_path / "pipe")) and is_endless("/dev/zero")
+    assert not any(
+        map(is_endless, (str(tmp_path / "file"), str(tmp_path), "gone", "/dev/stdin", "/dev/null", "a\0b", ""))
+    )
