@@ -18,7 +18,7 @@ _RATIO = 200
 """What is unpacked may be so many times as large as the file, or `_LARGE` [byte]; silhouettes pack twentyfold."""
 
 _DAMAGED = (
-    *(zlib.error, struct.error, tokenize.TokenError, SyntaxError, EOFError),
+    *(zipfile.BadZipFile, zlib.error, struct.error, tokenize.TokenError, SyntaxError, EOFError),
     *(LookupError, TypeError, ValueError, RuntimeError, OverflowError, OSError),
 )
 """What zipfile and numpy raise at bytes that are not as they were written."""
@@ -52,7 +52,7 @@ def read_npz(content: bytes) -> dict[str, NDArray[Any]]:
     """
     try:
         archive = zipfile.ZipFile(io.BytesIO(content))
-    except (zipfile.BadZipFile, *_DAMAGED) as error:
+    except _DAMAGED as error:
         raise ValueError(" ".join(str(error).split())) from error
     with archive:
         size = sum(member.file_size for member in archive.infolist())

@@ -6,6 +6,7 @@ import io
 import os
 import time
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -84,6 +85,15 @@ def test_what_is_packed_beyond_belief_is_not_unpacked(monkeypatch: pytest.Monkey
         archive.writestr("a.npy", npy(np.zeros(2**20)))
     with pytest.raises(ValueError, match="are packed into"):
         read_npz(packed.getvalue())
+
+
+def test_packed_arrays_with_a_changed_byte_are_refused_or_as_they_were() -> None:
+    np.savez_compressed(packed := io.BytesIO(), a=np.arange(9))
+    content = packed.getvalue()
+    for place in range(len(content)):
+        with suppress(ValueError):
+            found = read_npz(content[:place] + bytes([content[place] ^ 4]) + content[place + 1 :])
+            assert [array.tolist() for array in found.values()] in ([], [list(range(9))])
 
 
 def test_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
