@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from stackgen.geometry import silhouette_iou, tilt
 from stackgen.io.stacks_file import read_stacks
@@ -70,8 +71,11 @@ def test_the_drawings_can_be_drawn_again(tmp_path: Path) -> None:
     assert {drawing.file for drawing in script["DRAWINGS"]} == set(BUILDINGS)
     for drawing in script["DRAWINGS"]:
         script["save"](drawing, tmp_path)
-        again = read_silhouette(tmp_path / drawing.file, PAPER_GRID)
-        assert (again == read_silhouette(EXAMPLES / "silhouettes" / drawing.file, PAPER_GRID)).mean() > 0.999
+        again, there = (
+            np.asarray(Image.open(folder / drawing.file).convert("RGBA"), float)
+            for folder in (tmp_path, EXAMPLES / "silhouettes")
+        )
+        assert np.abs(again - there).mean() < 0.5
 
 
 def test_the_stacks_do_what_their_comments_say(checker: SimulatorChecker) -> None:

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stackgen.errors import StackgenError
+from stackgen.robot.real import gripper
 from stackgen.robot.real.gripper import DigitalJaws, Gripper, RealJaws, RobotiqJaws
 from tests.robot.real.arms import stand_in
 
@@ -76,7 +77,12 @@ def _floods(link: socket.socket) -> None:
 
 
 @pytest.mark.parametrize("handle", [_drips, _floods, _says_nothing])
-def test_jaws_that_drip_flood_or_say_nothing_are_one_line_soon(handle: Callable[[socket.socket], None]) -> None:
+def test_jaws_that_drip_flood_or_say_nothing_are_one_line_soon(
+    handle: Callable[[socket.socket], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert gripper._PATIENCE <= 3
+    monkeypatch.setattr(gripper, "_PATIENCE", 0.5)
+
     def serve() -> None:
         link, _ = listener.accept()
         with link, suppress(OSError):
