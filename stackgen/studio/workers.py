@@ -13,6 +13,7 @@ import traceback
 from collections import OrderedDict, deque
 from collections.abc import AsyncGenerator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -66,7 +67,9 @@ class Workers:
         task.add_done_callback(self._starting.discard)
 
     async def _begin(self) -> None:
-        process = _Process(self._context, self._threads)
+        # The first one waits for the imports of the process that all are forked from.
+        make = partial(_Process, self._context, self._threads)
+        process = await asyncio.get_running_loop().run_in_executor(self._threads, make)
         async for _ in process.answer():
             pass
         self._give(process)

@@ -59,7 +59,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[Workers], Any]],
             Scripted.release = asyncio.Event()
             pool = Workers(1)
             pool.open()
-            await asyncio.sleep(0)
+            await asyncio.sleep(0.05)
             await test(pool)
             pool.close()
 
@@ -98,7 +98,7 @@ def test_what_is_cancelled_is_killed_and_replaced_and_who_waits_only_leaves(
         await asyncio.sleep(0.01)
         assert [process.killed for process in Scripted.made] == [False]
         working.cancel()
-        await asyncio.sleep(0.01)
+        await asyncio.sleep(0.05)
         assert [process.killed for process in Scripted.made] == [True, False]
         Scripted.release.set()
         with pytest.raises(Refused):

@@ -1,0 +1,163 @@
+"""The studio in a real Chromium: draw, generate, compare, tilt, build, download, come back, at three window sizes."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+playwright = pytest.importorskip("playwright.sync_api", reason="drives the browser: pip install playwright")
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+PATIENCE = 300_000  # [ms]
+SIZES = {"desktop": (1500, 950), "tablet": (1000, 1200), "phone": (390, 844)}
+OWN = ("data:", "blob:", "about:")
+GRAPHICS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # without a graphics card
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs chromium, chromium-browser or google-chrome on the PATH"),
+]
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A studio that runs, with one result to show."""
+    results = tmp_path_factory.mktemp("results")
+    shutil.copy("examples/stacks/cantilever.json", results / "stacks.json")
+    command = [sys.executable, "-m", "stackgen", "studio", "--port", "0", "--workers", "2", "--gallery", str(results)]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:
+        assert server.stdout
+        found = re.search(r"http://\S+", server.stdout.readline())
+        assert found
+        yield found.group()
+        server.terminate()
+
+
+@pytest.fixture(params=SIZES)
+def page(request: pytest.FixtureRequest, address: str) -> Iterator[Any]:
+    """The page in a window of each size; it asks nobody else, and no error is heard."""
+    width, height = SIZES[request.param]
+    heard: list[str] = []
+    with playwright.sync_playwright() as driver:
+        arguments = ["--no-sandbox", *GRAPHICS]
+        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=arguments, timeout=PATIENCE)
+        page = chromium.new_page(viewport={"width": width, "height": height})
+        page.set_default_timeout(PATIENCE)
+        page.on("pageerror", lambda error: heard.append(str(error)))
+        page.on("request", lambda asked: heard.extend([asked.url] * (not asked.url.startswith((address, *OWN)))))
+        page.goto(address)
+        page.locator("#method").wait_for()
+        yield page
+        chromium.close()
+    assert heard == []
+
+
+def drag(page: Any, start: tuple[float, float], end: tuple[float, float]) -> None:
+    """Draw from one place to another, in shares of the paper."""
+    box = page.locator("#sketch").bounding_box()
+    page.mouse.move(box["x"] + start[0] * box["width"], box["y"] + start[1] * box["height"])
+    page.mouse.down()
+    page.mouse.move(box["x"] + end[0] * box["width"], box["y"] + end[1] * box["height"], steps=4)
+    page.mouse.up()
+
+
+def draw_a_gate(page: Any) -> None:
+    page.get_by_role("button", name="Clear").click()
+    page.locator("#sketch").scroll_into_view_if_needed()
+    for start, end in (((0.05, 0.3), (0.2, 0.95)), ((0.8, 0.3), (0.95, 0.95)), ((0.05, 0.05), (0.95, 0.2))):
+        drag(page, start, end)
+
+
+def slide(page: Any, name: str, value: float) -> None:
+    change = "(e, v) => { e.value = v; e.dispatchEvent(new Event('input')); e.dispatchEvent(new Event('change')); }"
+    page.get_by_label(name).first.evaluate(change, str(value))
+
+
+def saved(page: Any, name: str) -> Path:
+    with page.expect_download() as download:
+        page.get_by_role("button", name=name, exact=True).first.click()
+    return Path(download.value.path())
+
+
+def drawn(page: Any) -> str:
+    return str(page.evaluate("localStorage.getItem('stackgen-studio')"))
+
+
+def test_from_a_drawing_to_files_and_back(page: Any, address: str) -> None:
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    draw_a_gate(page)
+    kept = drawn(page)
+    page.get_by_role("button", name="Undo").click()
+    assert drawn(page) != kept
+    page.get_by_role("button", name="Redo").click()
+    assert drawn(page) == kept
+    page.select_option("#compared", "ddpm-verdicts")
+    page.get_by_role("button", name="Generate").click()
+    page.locator(".pane[data-done]").nth(1).wait_for()
+    assert page.locator(".pane >> visible=true").count() == 2
+    assert page.locator(".overlays canvas").count() == 6
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    slide(page, "Tilt of the table in degrees", 44)
+    page.locator(".answer.falls").first.wait_for()
+    content = json.loads(saved(page, "stacks.json").read_text())
+    assert content["stacks"][0]["verdict"]["stable"]
+    assert saved(page, "GLB").read_bytes().startswith(b"glTF")
+    assert saved(page, "PNG").read_bytes().startswith(b"\x89PNG")
+    assert saved(page, "silhouette.png").read_bytes().startswith(b"\x89PNG")
+    assert b"ftyp" in saved(page, "MP4").read_bytes()[:16]
+    page.reload()
+    page.locator("#method").wait_for()
+    assert drawn(page).split(".")[:2] == kept.split(".")[:2]
+    page.get_by_role("button", name="Copy a link").click()
+    link = page.url
+    page.evaluate("localStorage.clear()")
+    page.goto("about:blank")
+    page.goto(link)
+    page.locator("#method").wait_for()
+    page.get_by_role("button", name="Clear").click()
+    page.get_by_role("button", name="Undo").click()
+    assert drawn(page).split(".")[:2] == kept.split(".")[:2]
+
+
+def test_an_empty_drawing_is_told_where_it_happened(page: Any) -> None:
+    page.get_by_role("button", name="Clear").click()
+    page.get_by_role("button", name="Generate").click()
+    assert "Nothing is drawn" in page.locator("#asking-error").text_content()
+
+
+def test_it_is_drawn_with_the_keyboard_alone(page: Any) -> None:
+    page.get_by_role("button", name="Clear").click()
+    empty = drawn(page)
+    page.locator("#sketch").focus()
+    for key in ("Space", "ArrowUp", "Space"):
+        page.keyboard.press(key)
+    assert drawn(page) != empty
+
+
+def test_results_are_shown_and_opened(page: Any) -> None:
+    page.get_by_role("button", name="Gallery").click()
+    page.get_by_role("button", name="stacks.json").first.click()
+    page.locator(".pane[data-done]").first.wait_for()
+    assert page.locator(".tabs button").count() >= 1
+
+
+@pytest.mark.parametrize("page", ["desktop"], indirect=True)
+def test_the_arm_builds_what_was_drawn(page: Any) -> None:
+    page.select_option("#presets", "Tower")
+    page.select_option("#compared", "")
+    page.get_by_role("button", name="Generate").click()
+    page.locator(".pane[data-done]").first.wait_for()
+    page.get_by_label("Speed").first.select_option("12")
+    page.get_by_role("button", name="Have the arm build it").first.click()
+    page.locator("[data-built]").wait_for()
+    assert "and it stands" in page.locator(".build .answer").first.text_content()
