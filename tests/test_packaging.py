@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -68,5 +69,9 @@ def test_a_wheel_works_outside_the_checkout(tmp_path: Path) -> None:
     arch = ROOT / "examples/silhouettes/arch.png"
     run("sample", arch, "--one_shot", "--blocks", "cube=2,long_rectangle=1", "--num_samples", "1", "--out", "out")
     run("show", "out/stacks.json", "--out", "shown.png")
+    run("sample", arch, "--num_samples", "1", "--out", "best")
+    run("check", "best/stacks.json")
+    if find_spec("pybullet"):
+        run("build", "best/stacks.json")
     assert (tmp_path / "shown.html").stat().st_size > 1000
     assert json.loads(run("dataset", "verify", place / "stackgen/assets/testset-v1", "--json"))["sound"]
