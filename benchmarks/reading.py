@@ -97,7 +97,7 @@ def main() -> None:
 def _in_one_part(stack: Stack) -> bool:
     """Tell whether a stack's silhouette is in one part, without holes or slits: drawn in blocks, these are not seen."""
     mask = silhouette(stack, LARGE)
-    whole = closed(mask, 6)
+    whole = closed(mask, 12)
     blank = whole & ~mask
     holes = int(components(~np.pad(whole, 1), connectivity=4)[0].max()) > 1
     return int(components(mask)[0].max()) == 1 and not holes and np.count_nonzero(blank) < 0.004 * mask.sum()
@@ -114,6 +114,7 @@ def photo_of(stack: Stack, rng: np.random.Generator) -> tuple[bytes, str]:
         width=int(rng.integers(4, 15)),
         crayon=float(rng.choice([0, 0, 0.15, 0.3])),
         paper=str(rng.choice(["plain", "plain", "ruled", "squared"])),
+        tone=[(240, 240, 240), (240, 240, 240), (240, 240, 240), (242, 228, 130), (222, 215, 200)][rng.integers(5)],
         beside=bool(rng.random() < 0.25),
         shadow=float(rng.choice([0, 0.3, 0.5, 0.6])),
         softness=float(rng.uniform(2, 30)),
@@ -131,7 +132,14 @@ def photo_of(stack: Stack, rng: np.random.Generator) -> tuple[bytes, str]:
     picture = DRAW["photographed"](sheet, photo)
     buffer = io.BytesIO()
     Image.fromarray(picture).save(buffer, "JPEG", quality=int(rng.integers(40, 95)))
-    hard = [style, photo.paper, f"zoom {photo.zoom}", f"shadow {photo.shadow}", f"table {photo.table[0]}"]
+    hard = [
+        style,
+        photo.paper,
+        f"zoom {photo.zoom}",
+        f"shadow {photo.shadow}",
+        f"table {photo.table[0]}",
+        f"tone {photo.tone[2]}",
+    ]
     return buffer.getvalue(), " ".join(hard + ["beside"] * photo.beside)
 
 

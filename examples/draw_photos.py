@@ -37,6 +37,7 @@ class Photo:
         width: Width of the pen [pixel of the sheet].
         crayon: Share of the paper that a crayon leaves bare in its stroke [0..1].
         paper: Lines of the paper.
+        tone: Colour of the paper.
         beside: Whether a name, a sun and a ground line are drawn, too.
         shadow: Share of the light that a shadow takes from part of the photo [0..1].
         softness: Width of the shadow's border [pixel].
@@ -57,6 +58,7 @@ class Photo:
     width: int = 9
     crayon: float = 0.0
     paper: Literal["plain", "ruled", "squared"] = "plain"
+    tone: tuple[int, int, int] = (240, 240, 240)
     beside: bool = False
     shadow: float = 0.0
     softness: float = 20.0
@@ -94,7 +96,7 @@ SHEET = (1188, 840)
 def sheet_with(stack: Stack, photo: Photo, cell: float = 150.0) -> Picture:
     """Draw the front of a stack on a sheet, (h, w, 3); `cell` is the edge of a cube [pixel]."""
     rng = np.random.default_rng(photo.seed)
-    sheet = np.full((*SHEET[::-1], 3), 240, dtype=np.uint8)
+    sheet = np.full((*SHEET[::-1], 3), photo.tone, dtype=np.uint8)
     _rule(sheet, photo.paper)
     drawn = np.zeros(SHEET[::-1], dtype=np.uint8)  # how much ink there is
     middle, ground = SHEET[0] * 0.52, SHEET[1] * 0.5 + 2 * cell

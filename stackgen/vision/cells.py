@@ -25,7 +25,7 @@ EMPTY, FULL, RISING, FALLING = range(4)
 
 _CELLS = ((EMPTY, EMPTY), (FULL, FULL), (RISING, FALLING))  # both halves of each kind of cell
 
-ALIKE = 0.9
+ALIKE = 0.93
 """Least IoU with the stretched figure for it to count as made of whole cells."""
 
 PIECE = 0.4

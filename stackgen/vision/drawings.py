@@ -18,7 +18,8 @@ from stackgen.vision.images import SMALLEST, Image8
 from stackgen.vision.masks import bounding_box, components
 from stackgen.world import Grid, Mask
 
-Levels = NDArray[np.float32]
+Levels = NDArray[np.uint8]
+Differences = NDArray[np.float32]
 
 WORK_SIZE = 768
 """Longer edge [pixel] every picture is brought to, so that edges are found to a fraction of a pixel."""
@@ -65,19 +66,19 @@ class Drawn:
         return bool(0.002 < share < 0.3)
 
 
-def find_drawn(image: Image8) -> Drawn:
-    """Find what is drawn.
+def find_drawn(image: Image8, look: Look) -> Drawn:
+    """Find what is drawn in a picture that was looked at.
 
     Raises:
         StackgenError: If nothing is, or everything.
     """
-    levels, place = _framed(*_levels(image))
-    difference, notes = _unlike_background(levels)
-    scale = WORK_SIZE / max(difference.shape)
-    difference = _resized(difference, scale)
-    if np.quantile(difference, 0.999) < _CONTRAST:
+    background, notes = _background(look.levels)
+    scale = WORK_SIZE / max(look.levels.shape)
+    levels = _resized(look.levels, scale)
+    difference = np.abs(levels - background).max(axis=2)
+    if np.count_nonzero(difference > _CONTRAST) < 0.001 * difference.size:
         raise StackgenError("is all one colour, so nothing or everything is in it; draw a structure on a background")
-    ink = _clean(_without_rim(difference > _threshold(difference)))
+    ink = _clean(_without_rim(difference > _threshold(difference[::2, ::2])))
     if ink.mean() > 0.98:
         raise StackgenError("the structure fills the whole frame; leave some background around it")
     if not ink.any():
@@ -89,9 +90,9 @@ def find_drawn(image: Image8) -> Drawn:
             f"the structure in it is only {columns / scale * image.factor:.0f} x {rows / scale * image.factor:.0f}"
             f" pixels; at least {SMALLEST} are needed, draw or scan it larger"
         )
-    tone = _resized(levels.mean(axis=2), scale)
-    like_paper = not look_at(image).flat and float(np.median(tone[ink])) > float(np.median(tone[~ink]))
-    return Drawn(ink, (difference / 255).astype(np.float32), scale, place, notes, like_paper)
+    tone = levels[..., -1]
+    like_paper = not look.flat and float(np.median(tone[ink])) > float(np.median(tone[~ink]))
+    return Drawn(ink, (difference / 255).astype(np.float32), scale, look.place, notes, like_paper)
 
 
 def _levels(image: Image8) -> tuple[Levels, tuple[int, int]]:
@@ -100,7 +101,7 @@ def _levels(image: Image8) -> tuple[Levels, tuple[int, int]]:
     Where part of a picture is transparent, that part or the rest is the structure, unless the rest is a rectangle
     with something in it.
     """
-    colours = image.colours.astype(np.float32)
+    colours = image.colours
     if image.alpha is None:
         return colours, (0, 0)
     opaque = image.alpha >= 128
@@ -111,9 +112,9 @@ def _levels(image: Image8) -> tuple[Levels, tuple[int, int]]:
     if opaque[rows, columns].mean() > 0.97 and min(inside.shape[:2]) >= SMALLEST:
         seen = inside[opaque[rows, columns]]
         if (np.quantile(seen, 0.995, axis=0) - np.quantile(seen, 0.005, axis=0)).max() > _CONTRAST:
-            inside = np.where(opaque[rows, columns, None], inside, np.median(seen, axis=0)).astype(np.float32)
+            inside = np.where(opaque[rows, columns, None], inside, np.median(seen, axis=0)).astype(np.uint8)
             return inside, (columns.start, rows.start)
-    return image.alpha[..., None].astype(np.float32), (0, 0)
+    return image.alpha[..., None], (0, 0)
 
 
 def _framed(levels: Levels, place: tuple[int, int]) -> tuple[Levels, tuple[int, int]]:
@@ -128,6 +129,8 @@ def _framed(levels: Levels, place: tuple[int, int]) -> tuple[Levels, tuple[int, 
     for _ in range(2):  # a border's corners show once a neighbouring side is gone
         part = levels[top:bottom, left:right]
         widths = [_border(np.rot90(part, turns), ground) for turns in range(4)]  # of the top, right, bottom and left
+        if not any(widths):
+            break
         top, right, bottom, left = top + widths[0], right - widths[1], bottom - widths[2], left + widths[3]
     rest = levels[top:bottom, left:right]
     if (np.quantile(rest, 0.995) - np.quantile(rest, 0.005)) < _CONTRAST and rest.mean() < levels[0].mean() - _CONTRAST:
@@ -139,6 +142,8 @@ def _border(levels: Levels, ground: NDArray[np.floating]) -> int:
     """Return the width of a line along the upper edge [pixel], 0 where there is none or it is as the ground (C,)."""
     most = max(1, round(_BORDER * len(levels)))
     if len(levels) < 4 * most:
+        return 0
+    if np.abs(np.median(levels[0], axis=0) - ground).max() <= _CONTRAST:
         return 0
     rows = levels[: 2 * most + 2]
     tones = np.median(rows, axis=1)
@@ -152,19 +157,20 @@ def _border(levels: Levels, ground: NDArray[np.floating]) -> int:
     return width + min(soft, 2) if width <= most else 0
 
 
-def _resized(difference: Levels, scale: float) -> Levels:
+def _resized(levels: Levels, scale: float) -> Differences:
     import cv2
 
-    height, width = (max(1, round(n * scale)) for n in difference.shape)
+    height, width = (max(1, round(n * scale)) for n in levels.shape[:2])
     how = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
-    return np.asarray(cv2.resize(difference, (width, height), interpolation=how), np.float32)
+    resized = cv2.resize(levels, (width, height), interpolation=how)
+    return np.asarray(resized, np.float32).reshape(height, width, -1)
 
 
-def _unlike_background(levels: Levels) -> tuple[Levels, tuple[str, ...]]:
-    """Return the largest difference (H, W) of any channel of `levels` (H, W, C) from the background's.
+def _background(levels: Levels) -> tuple[NDArray[np.float32], tuple[str, ...]]:
+    """Return the background's colour (C,) in `levels` (H, W, C), and what is doubtful of it.
 
-    The background is the median along the picture's edges; the lower one counts less, as structures often stand on
-    it. Taking the largest channel makes colours of equal brightness differ, and stays linear over a blurred edge, so
+    It is the median along the picture's edges; the lower one counts less, as structures often stand on it. The largest
+    difference of any channel from it makes colours of equal brightness differ, and stays linear over a blurred edge, so
     that half of it is the edge's middle.
     """
     band = max(1, round(min(levels.shape[:2]) * _EDGE_BAND))
@@ -179,10 +185,10 @@ def _unlike_background(levels: Levels) -> tuple[Levels, tuple[str, ...]]:
         if tone.min() > 165 and background.mean() < 128 and (np.abs(other - tone).max(axis=1) < _CONTRAST).mean() > 0.6:
             background = tone
             notes = ("The picture is cut off along its edges; what is dark in it was taken for the structure.",)
-    return np.abs(levels - background).max(axis=2), notes
+    return background.astype(np.float32), notes
 
 
-def _threshold(difference: Levels) -> float:
+def _threshold(difference: Differences) -> float:
     """Find the level where the structure begins: Otsu's, lowered while a paler part of the structure lies under it.
 
     A white house with a dark roof on grey has two steps. A paler part is told from a blurred edge by
@@ -209,7 +215,7 @@ def _threshold(difference: Levels) -> float:
     return threshold
 
 
-def _otsu(values: Levels) -> float:
+def _otsu(values: Differences) -> float:
     """Return the middle between the means of two groups of values [0..255], split by Otsu's method (1979)."""
     import cv2
 
@@ -300,12 +306,16 @@ class Look:
     """What tells a drawing from a photo in a picture, less a border along its edges.
 
     Args:
+        levels: (H, W, C) its colours, or opacity.
+        place: (left, top) of these in the picture as it was read [pixel].
         flat: Whether neighbouring pixels are equal nearly everywhere, as drawing programs leave them and no camera.
         two_tone: Whether it has two tones, but for grain and soft edges.
         even: Whether the background is of one colour: most places along the picture's edge are alike.
         on_white: Whether most of the picture's edge is light and colourless.
     """
 
+    levels: Levels
+    place: tuple[int, int]
     flat: bool
     two_tone: bool
     even: bool
@@ -328,14 +338,18 @@ class Look:
 
 def look_at(image: Image8) -> Look:
     """Find what tells a drawing from a photo."""
-    levels, _ = _framed(*_levels(image))
+    levels, place = _framed(*_levels(image))
     green = levels[..., levels.shape[2] // 2]
     same = (green[1:, 1:] == green[1:, :-1]) & (green[1:, 1:] == green[:-1, 1:])
     edges = (levels[0], levels[-1], levels[:, 0], levels[:, -1])
     tone = np.median(np.concatenate(edges), axis=0)
+    step = max(1, max(levels.shape) // (WORK_SIZE // 2))
+    some = np.moveaxis(levels[::step, ::step], 2, 0)
     return Look(
+        levels,
+        place,
         flat=float(np.count_nonzero(same)) > 0.8 * same.size,
-        two_tone=any(of_two_tones(end(levels, axis=2).astype(np.uint8)) for end in (np.max, np.min)),
+        two_tone=any(of_two_tones(end.reduce(some)) for end in (np.maximum, np.minimum)),
         even=_is_even(levels),
         on_white=bool(tone.min() > 140 and np.ptp(tone) < 40),
     )

@@ -189,16 +189,19 @@ def _only(mask: Mask, box: tuple[slice, slice]) -> Mask:
 
 
 def _erased_along(ink: Mask, path: NDArray[np.int64], width: float) -> Mask:
-    """Erase a line of some width along its row in each column (W,), where nothing else is with it."""
+    """Erase a line of some width along its row in each column (W,), and what is below it; what stands on it stays."""
     body = ink.copy()
     reach = max(2, round(0.75 * width))
-    for column, row in enumerate(path):
-        if row < 0:
-            continue
-        top, bottom = max(0, row - reach), min(len(ink), row + reach + 1)
-        run = np.count_nonzero(ink[max(0, top - reach) : bottom + reach, column])
-        if run <= 1.7 * width + 1:
+    alone = np.zeros(len(path), dtype=bool)
+    for column in np.flatnonzero(path >= 0):
+        top, bottom = max(0, path[column] - reach), min(len(ink), path[column] + reach + 1)
+        run = np.flatnonzero(ink[max(0, top - reach) : bottom + reach, column])
+        alone[column] = np.ptp(run) <= 1.7 * width if run.size else True
+        if alone[column]:
             body[top:bottom, column] = False
+    free = np.flatnonzero(alone)
+    for column in np.flatnonzero((path >= 0) & ~alone) if free.size else ():
+        body[round(float(np.interp(column, free, path[free]))) :, column] = False
     return body
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.vision.lines import bridged, hatched, with_base, without_ground, without_whiskers
-from stackgen.vision.masks import bounding_box, components, extent, is_round, largest, opened, touches_edge
+from stackgen.vision.masks import bounding_box, components, extent, is_round, largest, opened, rim
 from stackgen.world import Mask
 
 Ints = NDArray[np.int64]
@@ -36,6 +36,9 @@ THIN_FACE = 0.035
 
 _SOLID = 1.3
 """Ink that holds a disc of so many widths of the stroke as its radius is filled in: two strokes side by side do not."""
+
+FINE = 360
+"""Ink is filled at a scale at which the largest part is no larger than this [pixel]."""
 
 LOOSE = 0.3
 """Share of the strokes that may enclose nothing before an outline counts as open."""
@@ -280,7 +283,9 @@ _EDGE = 0.02  # what is nearer to the sheet's edge runs off it, by its longer ed
 _LEVEL = 0.06  # feet of one structure are level to within this, by its size
 
 
-def choose(ink: Mask, which: int | None = None, spread: bool = False, framed: bool = True) -> Filled:
+def choose(
+    ink: Mask, which: int | None = None, spread: bool = False, framed: bool = True, beyond: Mask | None = None
+) -> Filled:
     """Find the drawing among all that the ink (H, W) shows, and fill it.
 
     A name, a sun, a ground line are left out.
@@ -290,15 +295,32 @@ def choose(ink: Mask, which: int | None = None, spread: bool = False, framed: bo
         which: Number of the drawing, from the left; None where there is one.
         spread: Whether what stands apart on the same ground is one structure, which may be cropped to its edges.
         framed: Whether what runs off is left out, where something else is drawn.
+        beyond: (H, W) what of the sheet is not in the photo, into which drawings run off, too.
 
     Raises:
         StackgenError: If there are several drawings and none is asked for, fewer than asked for, or an outline is open.
     """
+    edge = rim(ink.shape, round(_EDGE * max(ink.shape)))
+    if beyond is not None:
+        edge |= beyond
+    scale = FINE / max(extent(largest(ink, 0)), 1)
+    if scale >= 1:
+        return _chosen(ink, edge, which, spread, framed)
+    small = [
+        cv2.resize(of.astype(np.float32), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for of in (ink, edge)
+    ]
+    found = _chosen(small[0] > 0.3, small[1] > 0.5, which, spread, framed)
+    mask = cv2.resize(found.mask.astype(np.float32), ink.shape[::-1], interpolation=cv2.INTER_LINEAR) >= 0.5
+    return replace(found, mask=np.asarray(mask), stroke=found.stroke / scale)
+
+
+def _chosen(ink: Mask, edge: Mask, which: int | None, spread: bool, framed: bool) -> Filled:
+    """Find the drawing in ink (H, W), as `choose` does, where what lies in `edge` (H, W) runs off."""
     groups = _groups(ink)
     found = [_one(group) for group in groups]
     seen = list(zip(groups, found, strict=True))
     if framed:
-        inner = [pair for pair in seen if not _at_edge(*pair)]
+        inner = [pair for pair in seen if not _at_edge(*pair, edge)]
         seen = inner if not spread or _most(inner) > RIVAL * _most(seen) else seen
     drawings = _that_can_be_read(seen, cut=len(seen) < len(found))
     if not spread:
@@ -343,10 +365,10 @@ def _most(pairs: list[tuple[Mask, Filled | StackgenError]]) -> int:
     return max((int(np.count_nonzero(part.mask)) for _, part in pairs if isinstance(part, Filled)), default=0)
 
 
-def _at_edge(group: Mask, part: Filled | StackgenError) -> bool:
+def _at_edge(group: Mask, part: Filled | StackgenError, edge: Mask) -> bool:
     """Tell whether what was found in a group of ink (H, W) runs off the sheet, as drawings may and the table does."""
     mask = part.mask if isinstance(part, Filled) else group
-    return touches_edge(mask, round(_EDGE * max(mask.shape)))
+    return bool(np.count_nonzero(mask & edge) > 2 * _EDGE * max(mask.shape))
 
 
 def _width(mask: Mask) -> int:

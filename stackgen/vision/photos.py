@@ -42,6 +42,8 @@ _STRAY = np.radians(2.0)
 
 _DARKER_THAN_SHADOW = 0.33  # share of the light of the paper
 
+_CUT = 12  # what is nearer to the photo's edge runs off it [pixel of the sheet]
+
 _MARGIN = 0.012  # strip along the sheet's edge in which its own edge may show, by its longer edge
 
 
@@ -55,6 +57,7 @@ class Page:
         sheet: Where it lies in the photo, None where no sides of a sheet are seen.
         notes: What was removed, a sentence each.
         contrast: Share of the light that the ink takes away.
+        beyond: (H, W) what of it is not in the photo.
     """
 
     ink: Mask
@@ -62,6 +65,7 @@ class Page:
     sheet: Sheet | None
     notes: tuple[str, ...]
     contrast: float
+    beyond: Mask
 
 
 def read_page(photo: Picture, sheet: Sheet | None) -> Page:
@@ -78,14 +82,16 @@ def read_page(photo: Picture, sheet: Sheet | None) -> Page:
     else:
         straight, turn = straightened(photo, sheet, WORK_SIZE)
     ink, darkness = find_ink(straight)
+    seen = cv2.warpPerspective(np.ones(photo.shape[:2], np.uint8), turn, ink.shape[::-1])
+    beyond = np.asarray(cv2.erode(seen, np.ones((2 * _CUT + 1,) * 2, np.uint8)) == 0)
     if sheet is not None:
         _clear_edge(ink, sheet.corners, turn)
     ink, ruled = without_rules(ink, darkness)
-    ink = strong(ink, darkness)
+    ink = strong(ink & (seen > 0), darkness)
     if np.count_nonzero(ink) < 2e-4 * ink.size:
         raise StackgenError("nothing is drawn on the sheet; draw a structure with a dark pen, filled or in outline")
     notes = ("The lines of the paper were removed.",) if ruled else ()
-    return Page(ink, turn, sheet, notes, float(np.median(darkness[ink])))
+    return Page(ink, turn, sheet, notes, float(np.median(darkness[ink])), beyond)
 
 
 def is_drawn_on(photo: Picture, sheet: Sheet) -> bool:

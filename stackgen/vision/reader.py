@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from stackgen.errors import StackgenError
 from stackgen.vision import depth, drawings, images
 from stackgen.vision.depth import DepthFrame
+from stackgen.vision.drawings import Look
 from stackgen.vision.images import Image8, Picture
 from stackgen.vision.lines import without_rules
 from stackgen.vision.masks import bounding_box, filling, place
@@ -46,6 +47,9 @@ _UNCLEAR = (
 
 _LEFT_OUT = 0.05
 """Share of the structure from which on what was left out, or added, is worth telling."""
+
+_CLEAR = 0.9
+"""Share of each side along which a sheet is seen in a picture that otherwise is a drawing of two tones."""
 
 _STRAY = 0.025
 """How far a hand strays from a straight side, by the size of the drawing."""
@@ -136,11 +140,13 @@ def read_picture(
         look = drawings.look_at(image)
         drawn = image.alpha is not None or look.sheetless or min(image.colours.shape[:2]) < LEAST_PHOTO
         sheet = None if as_ == "drawing" or drawn else find_sheet(image.colours)
-        if sheet is not None and (look.two_tone or sheet.seen < 4) and not is_drawn_on(image.colours, sheet):
-            sheet = None  # the ground between two strokes, or within a doorway, is no sheet
+        if sheet is not None and (look.two_tone or sheet.seen < 4):
+            clear = sheet.sureness > _CLEAR or not look.two_tone  # a structure that is light has gaps
+            if not clear or not is_drawn_on(image.colours, sheet):
+                sheet = None  # the ground between two strokes, or within a doorway, is no sheet
         if as_ == "photo" or (as_ is None and not drawn and (sheet is not None or not look.drawn)):
             return _of_photo(image, sheet, which, look.even, insisted=as_ is not None)
-        return _of_drawing(image, grid, which, look.flat, insisted=as_ is not None)
+        return _of_drawing(image, grid, which, look, insisted=as_ is not None)
     except StackgenError as error:
         raise StackgenError(f"{images.name_of(source)}: {error}") from error
 
@@ -175,11 +181,11 @@ def read_colours(path: str | Path) -> Picture:
         raise StackgenError(f"{path}: {error}") from error
 
 
-def _of_drawing(image: Image8, grid: Grid, which: int | None, flat: bool, insisted: bool) -> Reading:
+def _of_drawing(image: Image8, grid: Grid, which: int | None, look: Look, insisted: bool) -> Reading:
     """Read a drawing on an even ground; what is not flat may be a photo, at whose edges a table shows."""
-    drawn = drawings.find_drawn(image)
+    drawn = drawings.find_drawn(image, look)
     ink, _ = without_rules(drawn.ink, drawn.darkness)
-    found = choose(ink, which, spread=True, framed=not flat)
+    found = choose(ink, which, spread=True, framed=not look.flat)
     if not insisted and not found.stroke and drawn.drawn_on(found.mask):
         raise StackgenError(_UNCLEAR)
     sure = found.sureness * (0.8 if drawn.notes else 1.0)
@@ -195,7 +201,7 @@ def _of_photo(image: Image8, sheet: Sheet | None, which: int | None, even: bool,
         height, width = image.colours.shape[:2]
         raise StackgenError(f"the photo is only {width} x {height} pixels; take a larger one")
     page = read_page(image.colours, sheet)
-    found = choose(page.ink, which, spread=sheet is None and even and not insisted)
+    found = choose(page.ink, which, spread=sheet is None and even and not insisted, beyond=page.beyond)
     if sheet is None and not even and cv2.contourArea(_hull(found.mask)) > 0.55 * found.mask.size:
         raise StackgenError(_UNCLEAR)
     notes = page.notes

@@ -41,7 +41,7 @@ SUPPORT = 0.6
 
 _SEARCH = 400  # longer edge at which the sheet is looked for; all lengths below are pixels of this
 
-_TRIED = 60  # edges along which light is looked at
+_TRIED = 40  # edges along which light is looked at
 _MOST_LINES = 14  # those of them that may be sides, beside the photo's own
 _REACH = 500  # how far a line is followed to either side
 _BESIDE = 5  # how far from a side inside and outside are compared
@@ -165,7 +165,7 @@ def _best_quadrangle(small: Picture, lines: Floats) -> tuple[Floats, float] | No
 
     sureness, depth = least(steps), least(depths)
     areas = np.abs(_cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)) / 2 / (small.shape[0] * small.shape[1])
-    score = sureness * depth**0.5 * np.minimum(areas, 1) ** 0.25 * _UNSEEN ** np.count_nonzero(~seen, axis=1)
+    score = sureness * depth**0.5 * np.minimum(areas, 1) ** 0.35 * _UNSEEN ** np.count_nonzero(~seen, axis=1)
     enough = (np.count_nonzero(seen, axis=1) > 2) | ((np.count_nonzero(seen, axis=1) == 2) & (areas > 0.5))
     score[(sureness < SUPPORT) | ~enough | _is_frame(corners, small.shape)] = 0
     best = int(score.argmax())
@@ -207,7 +207,7 @@ def _steps(small: Picture, lines: Floats) -> tuple[Floats, Floats, Floats]:
 
     Returns:
         (2, N, T + 1) at how many places it does, with the paper on the one side and on the other; (2, N, T + 1) how
-        deep, up to 1 each; and (N, T + 1) at how many both sides are seen, none of the last four, the photo's own edges.
+        deep, up to 1 each; and (N, T + 1) at how many both sides are seen: none of the last four, the photo's own.
     """
     levels = [np.asarray(of, np.float32) for of in (least_channel(small), small.max(axis=2), _tint(small))]
     size = np.array(small.shape[1::-1])
@@ -229,7 +229,7 @@ def _steps(small: Picture, lines: Floats) -> tuple[Floats, Floats, Floats]:
         darker = np.log(np.maximum((light + 8) / (dark + 8), (value + 8) / (low + 8)))
         down = np.maximum(darker / 0.13, (tint - dull) / 18)
         dark_line = (far > _LEVEL * light) & (away > tint - 9)
-        light_line = within + 8 < 0.7 * (light + 8)
+        light_line = within + 8 < np.minimum(0.7 * (light + 8), 1.15 * (dark + 8))
         down[dark_line | light_line | ~known] = 0
         counts.append(_counted(down >= 1))
         depths.append(_counted(np.clip(down / 3, 0, 1)))
