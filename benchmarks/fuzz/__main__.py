@@ -56,12 +56,13 @@ def turns(kinds: Sequence[str], seed: int) -> Iterator[tuple[str, int]]:
 
 def run(kinds: Sequence[str], seed: int, inputs: int, out: Path | None) -> Tally:
     """Try inputs; what was found until an interruption is a result, too."""
-    tally, worker = Tally.begin(out, seed), Worker()
-    first = tally.inputs[str(seed)]
+    name = str(seed) if kinds == list(KINDS) else f"{seed} of {', '.join(kinds)}"
+    tally, worker = Tally.begin(out, name), Worker()
+    first = tally.inputs[name]
     with contextlib.suppress(KeyboardInterrupt):
         for kind, number in itertools.islice(turns(kinds, seed), first, inputs):
             outcome, text, seconds = worker.give(kind, number)
-            tally.inputs[str(seed)] += 1
+            tally.inputs[name] += 1
             tally.count(kind, outcome, text, seconds)
             if outcome not in ("ok", "refused"):
                 print(f"--- {kind} {number}: {outcome}\n{text[-1200:]}", flush=True)

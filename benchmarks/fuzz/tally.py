@@ -21,7 +21,7 @@ class Tally:
 
     Args:
         commit: State of the code that read them.
-        inputs: Number of inputs by the first seed of their run.
+        inputs: Number of inputs by their run: its first seed, and its kinds if they are not all.
         outcomes: Number of inputs by kind and outcome.
         seconds: Processor time by kind [s].
         defects: What was wrong, and how often.
@@ -34,12 +34,12 @@ class Tally:
     defects: Counter[str] = field(default_factory=Counter)
 
     @staticmethod
-    def begin(out: Path | None, seed: int) -> Tally:
-        """Take up the run of a seed where a file says that it was stopped, if the code is still the same."""
+    def begin(out: Path | None, name: str) -> Tally:
+        """Take up a run where a file says that it was stopped, if the code is still the same."""
         tally = Tally(machine()["commit"])
         if out is not None and out.exists():
             before = Tally.read(out)
-            if before.commit == tally.commit and list(before.inputs) == [str(seed)]:
+            if before.commit == tally.commit and list(before.inputs) == [name]:
                 return before
         return tally
 
@@ -84,12 +84,12 @@ def added(tallies: Sequence[Tally]) -> Tally:
     """Add runs up.
 
     Raises:
-        StackgenError: If they are of different code, or of the same seed.
+        StackgenError: If they are of different code, or of the same run.
     """
     total = Tally(tallies[0].commit)
     for tally in tallies:
         if tally.commit != total.commit or tally.inputs.keys() & total.inputs.keys():
-            raise StackgenError("--add takes results of one commit, each with a seed of its own")
+            raise StackgenError("--add takes results of one commit, each of another run")
         total.inputs += tally.inputs
         total.defects += tally.defects
         for kind, counts in tally.outcomes.items():
