@@ -1,5 +1,6 @@
 # make demo: silhouettes of examples/ become stacks in out/demo.    make test: linter, types, fast tests.
-# Both set up .venv first, once: again only after setup.cfg, pyproject.toml or constraints.txt change.
+# make studio: a page opens on which drawings become structures.
+# All set up .venv first, once: again only after setup.cfg, pyproject.toml or constraints.txt change.
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -10,10 +11,13 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3 python; do \
 	$$p -c '$(fits)' 2>/dev/null && echo $$p && break; done)
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2
 
-.PHONY: demo test test-all lint setup clean
+.PHONY: demo studio test test-all lint setup clean
 
 demo: $(STAMP)
 	$(BIN)/stackgen sample examples/silhouettes/* --num_samples 3 --out out/demo
+
+studio: $(STAMP)
+	$(BIN)/stackgen studio --open
 
 test: lint
 	$(PYTEST) -m "not slow"

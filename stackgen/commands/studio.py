@@ -35,7 +35,7 @@ def main(
     from stackgen.studio.serving import serve
 
     def ready(address: str) -> None:
-        print(f"The studio is at {address}; Ctrl-C ends it.", flush=True)
+        print(f"The studio is at {address} (Ctrl-C ends it)", flush=True)
         if open:
             threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
 

@@ -45,6 +45,8 @@ async function begin(): Promise<void> {
     byId("panes").classList.toggle("two", Boolean(methods[1]));
     document.body.classList.add("asked");
     cancel.hidden = false;
+    const first = panes[0]!.element;
+    if (first.getBoundingClientRect().top > innerHeight * 0.8) first.scrollIntoView({ behavior: "smooth" });
     const drawing = { cells: pad.drawing.cells, bits: pad.drawing.pack() };
     await Promise.all(methods.map((method, i) => method && panes[i]!.run(method, drawing, form.wish(method))));
     cancel.hidden = true;

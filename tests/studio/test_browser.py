@@ -37,7 +37,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:
         assert server.stdout
-        found = re.search(r"http://\S+", server.stdout.readline())
+        found = re.search(r"http://\S+/", server.stdout.readline())
         assert found
         yield found.group()
         server.terminate()

@@ -90,6 +90,7 @@ export class Bitmap {
       }
       run++;
     }
+    if (value) runs.push(run);
     const bytes: number[] = [];
     for (let run of runs) {
       for (; run > 127; run >>= 7) bytes.push(128 | (run & 127));

@@ -50,7 +50,8 @@ export class Building {
   take(file: StacksFile, place: number, stack: StackFacts): void {
     this.reset();
     Object.assign(this, { file, place, stack, placing: null });
-    this.order.max = this.order.value = String(stack.shapes.length);
+    this.order.max = String(stack.shapes.length);
+    this.order.value = this.order.max; // only now: a larger value would have been cut
   }
 
   /** Stops a build, and takes the arm away. */

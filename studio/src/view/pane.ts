@@ -154,7 +154,8 @@ export class Pane {
 
   private add({ number, ...stack }: Extract<Message, { kind: "stack" }>): void {
     this.stacks.push(stack);
-    const text = stack.front_iou === null ? `${number + 1}` : `${number + 1} · ${stack.front_iou.toFixed(2)}`;
+    const match = stack.stable ? stack.front_iou?.toFixed(2) : "falls";
+    const text = match ? `${number + 1} · ${match}` : `${number + 1}`;
     const verdict = stack.stable ? "stands" : "falls";
     const tab = button(text, () => this.choose(number), { role: "tab", class: verdict, "aria-selected": "false", "aria-label": `Structure ${number + 1}, ${verdict}` });
     this.tabs.append(tab);

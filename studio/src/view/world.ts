@@ -61,7 +61,7 @@ export class World {
       const mesh = this.meshes[shape]!;
       const body = new three.Mesh(mesh.body, new three.MeshStandardMaterial({ color: mesh.colour, roughness: 0.75 }));
       body.castShadow = body.receiveShadow = true;
-      body.userData.block = number;
+      Object.assign(body.userData, { block: number, colour: mesh.colour });
       const lines = new three.LineSegments(mesh.edges, new three.LineBasicMaterial({ color: 0x2c303a }));
       const group = new three.Group();
       group.add(body, lines);
@@ -95,8 +95,7 @@ export class World {
   mark(red: number[], faint: (block: number) => boolean = () => false): void {
     this.blocks.forEach((block, i) => {
       const body = block.children[0] as three.Mesh<three.BufferGeometry, three.MeshStandardMaterial>;
-      body.material.emissive.copy(red.includes(i) ? FALLEN : new three.Color(0));
-      body.material.emissiveIntensity = red.includes(i) ? 0.75 : 0;
+      body.material.color.copy(red.includes(i) ? FALLEN : body.userData.colour);
       body.material.transparent = faint(i);
       body.material.opacity = faint(i) ? 0.12 : 1;
       block.children[1]!.visible = !faint(i);

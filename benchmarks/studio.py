@@ -1,0 +1,234 @@
+"""How quick the studio answers, and whether any request of its schema makes it stumble.
+
+A studio is started as a user starts it. Times are those of a client on this machine: of the page's three files, of the
+first message of noise, and of three verified stacks. The fuzzer makes requests by the OpenAPI schema that the studio
+publishes, most of them with something wrong in it, and counts the statuses.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import random
+import re
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.client import HTTPConnection, HTTPResponse
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+
+from benchmarks.common import ROOT, argument_parser, plain_table, report, start, summary
+from stackgen.studio.work.drawings import pack
+
+LEANING = {
+    "format": "stackgen.stacks/1",
+    "cell_size_m": 0.05,
+    "seed": 0,
+    "physics": {"engine": "bullet", "cell_size": 0.05, "friction": 0.5, "density": 600.0, "gravity": 9.81},
+    "grid": {"width": 4, "height": 4, "image_size": 64, "pixels_per_cell": 14.0, "ground_margin": 4.0},
+    "stacks": [
+        {"blocks": [{"shape": "cube", "position": [x, 0, z], "rotation": [0, 0, 0]} for x, z in ((0, 0.5), (0.6, 1.5))]}
+    ],
+}
+"""A stack that falls, so that no arm builds it."""
+
+VALID = 0.03
+"""Share of the requests in which nothing is wrong."""
+
+_HEAVY = {"/api/build", "/api/generate", "/api/export"}
+_ODD: tuple[Any, ...] = (
+    *(None, True, -1, 0, 1e308, -1e308, 2**63, 10**30, 1e-320, "", "\ud800", "\x00", "../../etc/passwd", "a" * 5000),
+    *([], {}, [[]], {"": {}}, [None] * 100, float("nan"), float("inf")),
+)
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    options = argument_parser(__name__, __doc__)
+    options.add_argument("--runs", type=int, default=10, help="repetitions of what is timed")
+    options.add_argument("--requests", type=int, default=5000, help="requests of the fuzzer")
+    options.add_argument("--seed", type=int, default=0, help="seed of the fuzzer")
+    return options
+
+
+def main() -> None:
+    """Measure, then fuzz."""
+    chosen = parser().parse_args()
+    with studio() as address:
+        times = {name: summary([one(address) for _ in range(chosen.runs)]) for name, one in TIMED.items()}
+        statuses = fuzzed(address, chosen.requests, random.Random(chosen.seed))
+        alive = ask(address, "GET", "/api/start")[0] == 200
+    metrics = {"seconds": times, "requests": chosen.requests, "statuses": statuses, "alive": alive}
+    rows = [[name, f"{t['median']:.3f}", f"{t['min']:.3f}", f"{t['max']:.3f}"] for name, t in times.items()]
+    tables = [plain_table("seconds", ("what", "median", "least", "most"), rows)]
+    tables += [plain_table("fuzzer", ("status", "answers"), [[s, str(n)] for s, n in statuses.items()])]
+    report("studio", metrics, tables, chosen.out)
+
+
+@contextmanager
+def studio() -> Iterator[str]:
+    """Run a studio, and yield host and port once it is warm."""
+    command = [sys.executable, "-m", "stackgen", "studio", "--port", "0", "--gallery", str(ROOT / "examples")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as server:
+        assert server.stdout is not None
+        found = re.search(r"http://\S+/", server.stdout.readline())
+        assert found
+        address = urlsplit(found.group()).netloc
+        for _ in range(4):  # both processes are ready
+            ask(address, "POST", "/api/generate", wish())
+        yield address
+        server.terminate()
+
+
+def wish(seed: int = 0) -> dict[str, Any]:
+    """Ask for three verified stacks of the diffusion model, as the page does."""
+    arch = np.ones((56, 56), dtype=bool)
+    arch[14:, 14:42] = False
+    wanted = {"method": "ddpm-verdicts", "sampler": {"kind": "dpm", "steps": 10}, "seed": seed}
+    return {"drawing": {"cells": 4, "bits": pack(arch)}, "wish": wanted}
+
+
+@contextmanager
+def asked(address: str, method: str, path: str, body: Any = None) -> Iterator[HTTPResponse]:
+    """Ask, and yield what is answered as it comes."""
+    connection = HTTPConnection(address, timeout=600)
+    content = None if body is None else body if isinstance(body, bytes) else json.dumps(body).encode()
+    connection.request(method, path, content, {"Content-Type": "application/json"})
+    yield connection.getresponse()
+    connection.close()
+
+
+def ask(address: str, method: str, path: str, body: Any = None) -> tuple[int, bytes]:
+    """Ask, and return status and answer."""
+    with asked(address, method, path, body) as answer:
+        return answer.status, answer.read()
+
+
+def page(address: str) -> float:
+    """Time all that the page asks for before it can be drawn on [s]."""
+    began = time.perf_counter()
+    for path in ("/", "/studio.css", "/studio.js", "/api/start"):
+        assert ask(address, "GET", path)[0] == 200
+    return time.perf_counter() - began
+
+
+def first_frame(address: str) -> float:
+    """Time the first frame of the noise [s]; the rest is cancelled."""
+    began = time.perf_counter()
+    with asked(address, "POST", "/api/generate", wish(1)) as answer:
+        while b'"noise"' not in answer.readline():
+            pass
+        return time.perf_counter() - began
+
+
+def three_stacks(address: str) -> float:
+    """Time three stacks, verified and explained [s]."""
+    began = time.perf_counter()
+    status, content = ask(address, "POST", "/api/generate", wish(int(began * 1e6) % 1000))
+    assert status == 200 and content.count(b'"kind": "stack"') == 3
+    return time.perf_counter() - began
+
+
+def three_best(address: str) -> float:
+    """Time three stacks of search and network together [s]."""
+    began = time.perf_counter()
+    status, _ = ask(address, "POST", "/api/generate", {"drawing": wish()["drawing"]})
+    assert status == 200
+    return time.perf_counter() - began
+
+
+TIMED = {
+    "the page, all of it": page,
+    "three verified stacks, diffusion": three_stacks,
+    "three stacks, search and network": three_best,
+    "first frame of the noise": first_frame,
+}
+"""What is timed; the last one cancels, so a fresh process may be warming up beside it."""
+
+
+def fuzzed(address: str, number: int, chance: random.Random) -> dict[str, int]:
+    """Make requests by the schema, and count the statuses; a request without an answer counts as `none`."""
+    schema = json.loads(ask(address, "GET", "/openapi.json")[1])
+    targets = [(path, method.upper(), told) for path, by in schema["paths"].items() for method, told in by.items()]
+    statuses: Counter[str] = Counter()
+    often = [1 if path in _HEAVY else 6 for path, _, _ in targets]
+    for path, method, told in chance.choices(targets, often, k=number):
+        valid = chance.random() < VALID
+        body = None
+        if "requestBody" in told:
+            model = told["requestBody"]["content"]["application/json"]["schema"]
+            body = made(model, schema, chance)
+            body = body if valid else spoilt(body, chance)
+        item = chance.choice(["0123456789abcdef", "..%2f..%2fetc%2fpasswd", "x", "%00", "a" * 3000])
+        try:
+            status = str(ask(address, method, path.replace("{item}", item), body)[0])
+        except OSError as error:
+            status = f"none: {error}"
+        statuses[status] += 1
+        if not status.startswith(("2", "4")):
+            print(f"{status} {method} {path} {str(body)[:300]}", file=sys.stderr)
+    return dict(sorted(statuses.items()))
+
+
+def made(model: dict[str, Any], schema: dict[str, Any], chance: random.Random) -> Any:
+    """Make a value of a schema."""
+    if "$ref" in model:
+        model = schema["components"]["schemas"][model["$ref"].rpartition("/")[2]]
+    if "anyOf" in model:
+        return made(chance.choice(model["anyOf"]), schema, chance)
+    if "enum" in model or "const" in model:
+        return chance.choice(model.get("enum") or [model["const"]])
+    if model.get("title") == "File":
+        return copy.deepcopy(LEANING)
+    if model.get("title") == "Bits":
+        return wish()["drawing"]["bits"]
+    kind = model.get("type")
+    if kind == "object":
+        known = {name: made(inner, schema, chance) for name, inner in model.get("properties", {}).items()}
+        return known or {"cube": chance.randint(0, 9)}
+    low, high = model.get("minimum", 0), model.get("maximum", 10)
+    simple = {"integer": chance.randint(int(low), int(high)), "number": chance.uniform(low, high)}
+    return {**simple, "boolean": chance.random() < 0.5, "string": "search", "null": None}.get(str(kind), "")
+
+
+def spoilt(value: Any, chance: random.Random) -> Any:
+    """Put something wrong in one place, or make it no JSON at all."""
+    if chance.random() < 0.05:
+        whole = json.dumps(value).encode()
+        cut = chance.randrange(len(whole))
+        return chance.choice([whole[:cut], whole + b"}", b"[" * 50_000, b"\xff" + whole, whole.replace(b":", b"=")])
+    value = copy.deepcopy(value)
+    places = list(_places(value))
+    if not places:
+        return chance.choice(_ODD)
+    inside, key = chance.choice(places)
+    how = chance.random()
+    if how < 0.2 and isinstance(inside, dict):
+        del inside[key]
+    elif how < 0.3 and isinstance(inside, dict):
+        inside["unknown"] = chance.choice(_ODD)
+    elif how < 0.4 and isinstance(inside[key], list):
+        inside[key] = inside[key] * chance.choice([0, 2, 60])
+    else:
+        inside[key] = chance.choice(_ODD)
+    return value
+
+
+def _places(value: Any) -> Iterator[tuple[Any, Any]]:
+    """Name every place in a value by what it is in and its key."""
+    keys: list[Any] = list(value) if isinstance(value, dict) else list(range(len(value)))
+    for key in keys:
+        yield value, key
+        if isinstance(value[key], dict | list):
+            yield from _places(value[key])
+
+
+if __name__ == "__main__":
+    start(main)
