@@ -22,12 +22,9 @@ from stackgen.vision.depth import DepthFrame
 from stackgen.vision.images import Picture
 from stackgen.vision.masks import fitted
 from stackgen.vision.options import PictureOptions
-from stackgen.vision.reader import Reading, filling, place, read_picture, read_silhouette
+from stackgen.vision.reader import Reading, read_picture, read_silhouette
 from stackgen.viz.render import save_image
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, Mask
-
-_ROOM = 0.25
-"""What a structure may be larger than the grid [cell]."""
 
 
 @dataclass(frozen=True)
@@ -119,18 +116,9 @@ def _read(source: Source, picture: PictureOptions, image: Path | None) -> tuple[
 def _found(reading: Reading, freehand: bool) -> tuple[Mask, list[str]]:
     """Set what was read on the paper's grid, in cells where it is made of them; say what was found."""
     lines = [f"read as a {reading.describe()}", *reading.notes]
-    high = filling(reading.figure, PAPER_GRID)
-    if reading.cell is not None:
-        height, width = (edge / reading.cell for edge in reading.figure.shape)
-        if height > PAPER_GRID.height + _ROOM or width > PAPER_GRID.width + _ROOM:
-            raise StackgenError(
-                f"the structure is {width:.1f} x {height:.1f} cells, and the grid {PAPER_GRID.width} x"
-                f" {PAPER_GRID.height}; leave out --cell_size to have it scaled down"
-            )
-        high = height
-    as_seen = place(reading.figure, PAPER_GRID, high) if reading.exact is None else reading.exact
-    known = None if reading.cell is None else high
+    known = None if reading.cell is None else reading.height(PAPER_GRID)
     silhouette, cells, block_list = in_cells(reading.figure, PAPER_GRID, known)
+    as_seen = reading.silhouette(PAPER_GRID)
     return (as_seen if freehand else silhouette), [*lines, *_made_of(cells, block_list)]
 
 

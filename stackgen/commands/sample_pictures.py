@@ -57,6 +57,7 @@ def answer_all(
     results: list[StacksFile] = []
     sheets: list[Picture] = []
     refused: list[StackgenError] = []
+    seen: list[Sequence[str]] = []
     screen = Screen(stderr=True)
     with Progress(console=screen, transient=True, disable=not screen.is_terminal or is_quiet()) as progress:
         task = progress.add_task("", total=len(images))
@@ -73,20 +74,23 @@ def answer_all(
                     progress.advance(task)
                 sheets.append(write_result(result, folder, reading.overlay))
                 results.append(result)
+                seen.append((f"read as a {reading.describe()}", *reading.notes))
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"{len(results)} of {len(images)} images are finished in {out}") from None
     if not results:
         raise refused[0]
     if len(images) > 1:
         save_image(out / "overview.png", overview(sheets))
-    code = report(results, out, verified)
+    code = report(results, seen, out, verified)
     for reason in refused:
         print(f"stackgen: error: {printable(reason)}", file=sys.stderr)
     return 2 if refused else code
 
 
-def report(results: Sequence[StacksFile], out: Path, verified: bool) -> int:
-    """Tell what became of the images; the exit code is 1 if a stack falls that was said to be verified."""
+def report(results: Sequence[StacksFile], seen: Sequence[Sequence[str]], out: Path, verified: bool) -> int:
+    """Tell what was seen in the images and became of them; the exit code is 1 if a verified stack falls after all."""
+    for result, lines in zip(results, seen, strict=True):
+        tell(f"{result.silhouette}: {' '.join([f'{lines[0]}.', *lines[1:]])}")
     tell(verdict_table("image", [(result.silhouette or "", result.entries) for result in results], most=1))
     falls = False
     for result in results if verified else ():
@@ -106,13 +110,14 @@ def report(results: Sequence[StacksFile], out: Path, verified: bool) -> int:
     facts = [
         {
             "image": result.silhouette,
+            "found": lines,
             "comment": result.comment,
             "stacks": [
                 {"blocks": format_block_list(entry.stack.counts, entry.stack.catalogue), **verdict_facts(entry)}
                 for entry in result.entries
             ],
         }
-        for result in results
+        for result, lines in zip(results, seen, strict=True)
     ]
     tell(images=facts)
     wrote(out)

@@ -196,7 +196,7 @@ def _erased_along(ink: Mask, path: NDArray[np.int64], width: float) -> Mask:
     for column in np.flatnonzero(path >= 0):
         top, bottom = max(0, path[column] - reach), min(len(ink), path[column] + reach + 1)
         run = np.flatnonzero(ink[max(0, top - reach) : bottom + reach, column])
-        alone[column] = np.ptp(run) <= 1.7 * width if run.size else True
+        alone[column] = np.ptp(run) <= 1.35 * width if run.size else True
         if alone[column]:
             body[top:bottom, column] = False
     free = np.flatnonzero(alone)
@@ -247,6 +247,9 @@ def _followed(
                     row = 0.6 * row + 0.4 * float(np.mean(trail[-6:]))
                 path[column] = round(row)
             column += step
+    known = np.flatnonzero(path >= 0)
+    between = np.arange(known[0], known[-1] + 1)
+    path[between] = np.round(np.interp(between, known, path[known]))
     return path, width
 
 

@@ -306,9 +306,8 @@ def choose(
     scale = FINE / max(extent(largest(ink, 0)), 1)
     if scale >= 1:
         return _chosen(ink, edge, which, spread, framed)
-    small = [
-        cv2.resize(of.astype(np.float32), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA) for of in (ink, edge)
-    ]
+    size = (round(ink.shape[1] * scale), round(ink.shape[0] * scale))
+    small = [cv2.resize(of.astype(np.float32), size, interpolation=cv2.INTER_AREA) for of in (ink, edge)]
     found = _chosen(small[0] > 0.3, small[1] > 0.5, which, spread, framed)
     mask = cv2.resize(found.mask.astype(np.float32), ink.shape[::-1], interpolation=cv2.INTER_LINEAR) >= 0.5
     return replace(found, mask=np.asarray(mask), stroke=found.stroke / scale)

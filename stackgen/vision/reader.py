@@ -51,6 +51,9 @@ _LEFT_OUT = 0.05
 _CLEAR = 0.9
 """Share of each side along which a sheet is seen in a picture that otherwise is a drawing of two tones."""
 
+_ROOM = 0.25
+"""What a structure of known size may be larger than the grid [cell]."""
+
 _STRAY = 0.025
 """How far a hand strays from a straight side, by the size of the drawing."""
 
@@ -90,11 +93,27 @@ class Reading:
         kinds = {"drawing": "drawing", "photo": "photo of a sketch", "depth": "depth frame"}
         return f"{kinds[self.kind]} (confidence {self.confidence:.0%})"
 
+    def height(self, grid: Grid) -> float:
+        """Return the height [cell] that the figure has on a grid: its own where it is known, else that which fills it.
+
+        Raises:
+            StackgenError: If it is known, and larger than the grid.
+        """
+        if self.cell is None:
+            return filling(self.figure, grid)
+        height, width = (edge / self.cell for edge in self.figure.shape)
+        if height > grid.height + _ROOM or width > grid.width + _ROOM:
+            raise StackgenError(
+                f"the structure is {width:.1f} x {height:.1f} cells, and the grid {grid.width} x {grid.height};"
+                " leave out --cell_size to have it scaled down"
+            )
+        return height
+
     def silhouette(self, grid: Grid) -> Mask:
-        """Return the silhouette (image_size, image_size), scaled until it fills a grid, or as the picture has it."""
+        """Return the silhouette (image_size, image_size), as high as it is on a grid, or as the picture has it."""
         if self.exact is not None and len(self.exact) == grid.image_size:
             return self.exact
-        return place(self.figure, grid, filling(self.figure, grid))
+        return place(self.figure, grid, self.height(grid))
 
 
 def read_picture(
