@@ -16,7 +16,9 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import iou, silhouette
 from stackgen.stack import Stack
 from stackgen.studio.requests import CELL, Drawing
+from stackgen.vision.drawings import fits
 from stackgen.vision.masks import bounding_box
+from stackgen.vision.reader import Reading, read_picture
 from stackgen.world import PAPER_GRID, Grid, Mask, View
 
 Picture = NDArray[np.uint8]
@@ -81,6 +83,14 @@ def picture_of(mask: Mask) -> Picture:
     bottom = size - int(PAPER_GRID.ground_margin)
     canvas[bottom - len(figure) : bottom, left : left + figure.shape[1]] = figure
     return np.where(canvas, 0, 255).astype(np.uint8)
+
+
+def reading_of(picture: Picture) -> Reading:
+    """Read the picture of a drawing; one of the grid's silhouettes is at once what reading it would say."""
+    mask = picture == 0
+    if len(mask) != PAPER_GRID.image_size or not fits(mask, PAPER_GRID):
+        return read_picture(picture, PAPER_GRID)
+    return Reading(mask[bounding_box(mask)], "drawing", 1.0, np.repeat(picture[..., None], 3, axis=2), exact=mask)
 
 
 def png(picture: NDArray[np.uint8]) -> bytes:

@@ -25,7 +25,7 @@ from stackgen.protocols import StackSampler
 from stackgen.sampling.verified import Budget
 from stackgen.stack import shapes_of
 from stackgen.studio.requests import GenerateRequest, ReadRequest, Wish
-from stackgen.studio.work.drawings import cells_high, mask_of, pack, picture_of, png
+from stackgen.studio.work.drawings import cells_high, mask_of, pack, picture_of, png, reading_of
 from stackgen.studio.work.judging import Message, Recorder, entry_facts, physics_of
 from stackgen.studio.work.methods import BEST, methods
 from stackgen.vision.drawings import grid_offset
@@ -35,7 +35,7 @@ from stackgen.world import PAPER_GRID, Grid, Mask, World
 
 Send = Callable[[Message], None]
 
-DRAWS = 16
+DRAWS = 8
 """Stacks that verified sampling draws for a block list, at most."""
 
 _SHOWN = 8  # stacks that are shown while they are denoised
@@ -52,7 +52,7 @@ def generate(request: GenerateRequest, send: Send) -> None:
     if wish.method not in {method["name"] for method in methods()}:
         raise StackgenError(f"method: there is no {wish.method!r}; /api/methods lists them")
     picture = picture_of(mask)
-    reading = read_picture(picture, PAPER_GRID)
+    reading = reading_of(picture)
     found, recorder = _best(reading, mask, wish) if wish.method == BEST else _of_model(reading, wish, send)
     found = replace(found, silhouette="silhouette.png")
     send(
