@@ -168,7 +168,7 @@ def find_structure(frame: DepthFrame) -> SeenStructure:
             f"nothing stands in front of the background: no block is nearer than it by {1e3 * IN_FRONT:g} mm"
         )
     pixels_per_metre = frame.camera[0] / float(np.median(frame.depth[foreground]))
-    seen = largest(foreground, round(JOINT * pixels_per_metre))
+    seen = largest(foreground, round(min(JOINT * pixels_per_metre, max(foreground.shape))))
     holes = _failed_within(frame, seen)
     picture, outline = _straight_on(frame, seen, holes, planes)
     front = largest(smoothed(picture, MEDIAN), round(JOINT / PIXEL))

@@ -108,7 +108,9 @@ def test_the_background_alone_holds_nothing() -> None:
         find_structure(simulated_frame(empty))
 
 
-@pytest.mark.parametrize(("focal", "line"), [(1.0, r"would be .* m: see"), (30.0, "too far apart to be a front")])
+@pytest.mark.parametrize(
+    ("focal", "line"), [(1.0, r"would be .* m: see"), (30.0, "too far apart to be a front"), (1e9, "no plane front")]
+)
 def test_a_wrong_focal_length_is_one_line_at_once(focal: float, line: str) -> None:
     with pytest.raises(StackgenError, match=line):
         find_structure(DepthFrame(simulated_frame(ARCH).depth, None, focal))
