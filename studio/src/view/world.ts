@@ -127,7 +127,7 @@ export class World {
     this.asked = true;
     requestAnimationFrame((now) => {
       this.asked = false;
-      const seconds = Math.min(0.1, (now - this.last) / 1000);
+      const seconds = Math.min(0.5, (now - this.last) / 1000);
       this.last = now;
       if (this.onFrame(seconds)) this.paint();
       this.renderer.render(this.scene, this.camera);
