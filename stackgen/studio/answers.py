@@ -38,45 +38,49 @@ class WorkResponse(Response):
     def __init__(self, messages: AsyncGenerator[bytes, None], form: Form = "json") -> None:
         super().__init__()
         self.messages, self.form = messages, form
+        self.begun = False
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """See ASGI."""
         gone = asyncio.create_task(_gone(receive))
         work = asyncio.create_task(self._answer(scope, receive, send))
-        await asyncio.wait({gone, work}, return_when=asyncio.FIRST_COMPLETED)
-        for task in (gone, work):
-            if not task.done():
-                task.cancel()
+        try:
+            await asyncio.wait({gone, work}, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            gone.cancel()
+            work.cancel()
         with contextlib.suppress(asyncio.CancelledError):
             await work
 
     async def _answer(self, scope: Scope, receive: Receive, send: Send) -> None:
-        begun = False
         try:
             async with contextlib.aclosing(self.messages) as messages:
-                last = b"{}"
-                async for last in messages:
-                    if self.form == "lines":
-                        if not begun:
-                            await send(_start(LINES))
-                            begun = True
-                        await send({"type": "http.response.body", "body": last + b"\n", "more_body": True})
+                await (self._lines if self.form == "lines" else self._last)(messages, send)
         except (Refused, Busy, Broken) as error:
             status, sentence = _told(error)
-            if not begun:
+            if self.begun:
+                line = json.dumps({"kind": "error", "detail": sentence}).encode() + b"\n"
+                await send({"type": "http.response.body", "body": line})
+            else:
                 await refusal(status, sentence)(scope, receive, send)
-                return
-            last = json.dumps({"kind": "error", "detail": sentence}).encode() + b"\n"
-            await send({"type": "http.response.body", "body": last})
-            return
-        if self.form != "lines":
-            await send(_start("application/json" if self.form == "json" else json.loads(last)["media"]))
-        body = {
-            "lines": lambda: b"",
-            "json": lambda: last,
-            "file": lambda: base64.b64decode(json.loads(last)["content"]),
-        }
-        await send({"type": "http.response.body", "body": body[self.form]()})
+
+    async def _lines(self, messages: AsyncGenerator[bytes, None], send: Send) -> None:
+        """Send each message as it comes; the first one decides that there is an answer."""
+        async for message in messages:
+            if not self.begun:
+                await send(_start(LINES))
+                self.begun = True
+            await send({"type": "http.response.body", "body": message + b"\n", "more_body": True})
+        await send({"type": "http.response.body", "body": b""})
+
+    async def _last(self, messages: AsyncGenerator[bytes, None], send: Send) -> None:
+        """Send the last message, or the file in it."""
+        content, media = [message async for message in messages][-1], "application/json"
+        if self.form == "file":
+            file = json.loads(content)
+            content, media = base64.b64decode(file["content"]), file["media"]
+        await send(_start(media))
+        await send({"type": "http.response.body", "body": content})
 
 
 def _told(error: Exception) -> tuple[int, str]:
