@@ -87,7 +87,9 @@ def test_the_commands_of_a_page_parse(
     monkeypatch.chdir(ROOT)
     words = shlex.split(line)
     if words[:2] == ["python", "-m"] and words[2].startswith("benchmarks."):
-        importlib.import_module(words[2]).parser().parse_args(words[3:])
+        module = importlib.import_module(words[2])
+        main = importlib.import_module(f"{words[2]}.__main__") if hasattr(module, "__path__") else module
+        main.parser().parse_args(words[3:])
         return
     assert words[0] == "stackgen", line
     answer = cli(*words[1:], "--print_config")  # parses everything, runs nothing

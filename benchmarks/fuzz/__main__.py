@@ -10,6 +10,7 @@ a hang, the end of the process or a file that is left half written is a defect, 
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import io
 import itertools
@@ -71,14 +72,19 @@ def run(kinds: Sequence[str], seed: int, inputs: int, out: Path | None) -> Tally
     return tally
 
 
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    options = argument_parser("fuzz", __doc__)
+    options.add_argument("--inputs", type=int, default=1000, help="number of inputs, shared by the kinds")
+    options.add_argument("--seed", type=int, default=0, help="seed of the first input of each kind")
+    options.add_argument("--only", nargs="*", choices=KINDS, default=list(KINDS), help="kinds that are tried")
+    options.add_argument("--add", nargs="+", type=Path, metavar="FILE", help="results to add up; nothing is tried")
+    return options
+
+
 def main() -> None:
     """Try inputs and print what became of them."""
-    parser = argument_parser("fuzz", __doc__)
-    parser.add_argument("--inputs", type=int, default=1000, help="number of inputs, shared by the kinds")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the first input of each kind")
-    parser.add_argument("--only", nargs="*", choices=KINDS, default=list(KINDS), help="kinds that are tried")
-    parser.add_argument("--add", nargs="+", type=Path, metavar="FILE", help="results to add up; nothing is tried")
-    options = parser.parse_args()
+    options = parser().parse_args()
     if options.add:
         tally = added([Tally.read(path) for path in options.add])
     else:
