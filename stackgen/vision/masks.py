@@ -77,6 +77,27 @@ def largest(mask: Mask, gap: int) -> Mask:
     return np.asarray(mask & (labels == areas.argmax()))
 
 
+def near_parts(ink: Mask, together: float) -> list[Mask]:
+    """Return the parts of the ink (H, W) that are near to each other, without dirt.
+
+    Args:
+        ink: All that is drawn; what an outline encloses belongs to it.
+        together: What is nearer than this, by the size of the largest part, is one part.
+    """
+    import cv2
+
+    labels, areas = components(ink)
+    boxes = [bounding_box(labels == number) for number in np.argsort(areas)[::-1][:5] if areas[number]]
+    size = max(max(rows.stop - rows.start, columns.stop - columns.start) for rows, columns in boxes)
+    blank, _ = components(np.pad(~ink, 1, constant_values=True), connectivity=4)
+    within = blank[1:-1, 1:-1] != blank[0, 0]
+    far = cv2.distanceTransform((~(ink | within)).astype(np.uint8), cv2.DIST_L2, 3)
+    groups, _ = components(far <= together * size / 2)
+    groups = np.where(ink, groups, 0)
+    parts = [groups == number for number in range(1, int(groups.max()) + 1)]
+    return [part for part in parts if extent(part) > 0.1 * size] if size else []
+
+
 def smoothed(mask: Mask, size: int) -> Mask:
     """Apply a median filter of `size` x `size` pixels (odd)."""
     import cv2

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.vision.lines import bridged, hatched, with_base, without_ground, without_whiskers
-from stackgen.vision.masks import bounding_box, components, extent, is_round, largest, opened, rim
+from stackgen.vision.masks import bounding_box, components, extent, is_round, largest, near_parts, opened, rim
 from stackgen.world import Mask
 
 Ints = NDArray[np.int64]
@@ -92,8 +92,7 @@ def fill(ink: Mask) -> Filled:
     work = np.pad(ink[rows, columns], margin)
     found = _mended(work, size)
     whole = np.zeros_like(ink)
-    inner = found.mask[margin:-margin, margin:-margin]
-    whole[rows, columns] = inner
+    whole[rows, columns] = found.mask[margin:-margin, margin:-margin]
     return Filled(whole, found.stroke, found.notes, found.sureness)
 
 
@@ -315,7 +314,7 @@ def choose(
 
 def _chosen(ink: Mask, edge: Mask, which: int | None, spread: bool, framed: bool) -> Filled:
     """Find the drawing in ink (H, W), as `choose` does, where what lies in `edge` (H, W) runs off."""
-    groups = _groups(ink)
+    groups = near_parts(ink, TOGETHER)
     found = [_one(group) for group in groups]
     seen = list(zip(groups, found, strict=True))
     if framed:
@@ -342,9 +341,7 @@ def _chosen(ink: Mask, edge: Mask, which: int | None, spread: bool, framed: bool
         )
     left_out = len(found) - 1 - len(beside)
     notes = main.notes + (("What is drawn beside the structure was left out.",) if left_out else ())
-    mask = main.mask.copy()
-    for part in beside:
-        mask |= part.mask
+    mask = np.any([part.mask for part in (main, *beside)], axis=0)
     return Filled(mask, main.stroke, notes, main.sureness * (0.95 if left_out else 1.0))
 
 
@@ -373,20 +370,6 @@ def _at_edge(group: Mask, part: Filled | StackgenError, edge: Mask) -> bool:
 def _width(mask: Mask) -> int:
     """Return the lesser edge of a mask's box, which is small for a line [pixel]."""
     return min(mask[bounding_box(mask)].shape)
-
-
-def _groups(ink: Mask) -> list[Mask]:
-    """Return the parts of the ink (H, W) that are near to each other, without dirt."""
-    labels, areas = components(ink)
-    boxes = [bounding_box(labels == number) for number in np.argsort(areas)[::-1][:5] if areas[number]]
-    size = max(max(rows.stop - rows.start, columns.stop - columns.start) for rows, columns in boxes)
-    blank, _ = components(np.pad(~ink, 1, constant_values=True), connectivity=4)
-    within = blank[1:-1, 1:-1] != blank[0, 0]  # what an outline encloses belongs to it
-    far = cv2.distanceTransform((~(ink | within)).astype(np.uint8), cv2.DIST_L2, 3)
-    groups, _ = components(far <= TOGETHER * size / 2)
-    groups = np.where(ink, groups, 0)
-    parts = [groups == number for number in range(1, int(groups.max()) + 1)]
-    return [part for part in parts if max(part[bounding_box(part)].shape) > 0.1 * size] if size else []
 
 
 def _one(group: Mask) -> Filled | StackgenError:

@@ -42,6 +42,8 @@ _STRAY = np.radians(2.0)
 
 _DARKER_THAN_SHADOW = 0.33  # share of the light of the paper
 
+_COLOURED = 1.25  # largest by least channel of paper from which on it is coloured
+
 _CUT = 12  # what is nearer to the photo's edge runs off it [pixel of the sheet]
 
 _MARGIN = 0.012  # strip along the sheet's edge in which its own edge may show, by its longer edge
@@ -105,8 +107,11 @@ def is_drawn_on(photo: Picture, sheet: Sheet) -> bool:
 def find_ink(sheet: Picture) -> tuple[Mask, NDArray[np.float32]]:
     """Find what is darker (H, W) than the paper of a sheet (H, W, 3), and by which share of the light.
 
-    Of the channels the darkest counts: a crayon of any colour takes the light of one.
+    Of the channels the darkest counts, by the paper's own colour: a crayon of any colour takes the light of one.
     """
+    tone = np.quantile(sheet[::8, ::8].reshape(-1, 3), 0.75, axis=0).clip(1)
+    if tone.max() > _COLOURED * tone.min():
+        sheet = np.clip(sheet * (tone.max() / tone).astype(np.float32), 0, 255).astype(np.uint8)
     light = cv2.GaussianBlur(least_channel(sheet), (0, 0), 0.8)
     size = max(2, round(BESIDE * max(light.shape))) | 1
     paper = cv2.morphologyEx(cv2.medianBlur(light, 5), cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))

@@ -222,13 +222,13 @@ def _steps(small: Picture, lines: Floats) -> tuple[Floats, Floats, Floats]:
     for side in (-1, 1):
         (light, value, tint), here = beside(side * _BESIDE)
         (dark, low, dull), there = beside(-side * _BESIDE)
-        (far, _, away), _ = beside(-side * _BEYOND)
+        (far, high, away), _ = beside(-side * _BEYOND)
         (within, _, _), _ = beside(side * _BEYOND)
         known = here & there
         known[-4:] = False
         darker = np.log(np.maximum((light + 8) / (dark + 8), (value + 8) / (low + 8)))
         down = np.maximum(darker / 0.13, (tint - dull) / 18)
-        dark_line = (far > _LEVEL * light) & (away > tint - 9)
+        dark_line = (far > _LEVEL * light) & (high > _LEVEL * value) & (away > tint - 9)
         light_line = within + 8 < np.minimum(0.7 * (light + 8), 1.15 * (dark + 8))
         down[dark_line | light_line | ~known] = 0
         counts.append(_counted(down >= 1))

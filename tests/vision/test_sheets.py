@@ -33,6 +33,27 @@ def test_a_shadow_across_the_sheet_does_no_harm(softness: float, table: tuple[in
     assert sheet is not None and np.abs(sheet.corners - CORNERS).max() < 6
 
 
+def test_stripes_of_the_table_are_no_sides() -> None:
+    photo = photo_with(CORNERS, table=(165, 160, 150)).astype(np.float32)
+    stripes = 1 + 0.1 * np.sin(np.arange(600) / 9)[:, None, None]
+    sheet = find_sheet(np.where(photo > 225, photo, photo * stripes).astype(np.uint8))
+    assert sheet is not None and np.abs(sheet.corners - CORNERS).max() < 4
+
+
+def test_a_shadow_along_a_side_divides_no_sheet() -> None:
+    shade = np.ones((600, 800), dtype=np.float32)
+    cv2.fillPoly(shade, [np.array([[420, 130], [900, 155], [900, 700], [420, 700]])], 0.4)
+    sheet = find_sheet((photo_with(CORNERS, table=(60, 62, 66)) * shade[..., None]).astype(np.uint8))
+    assert sheet is not None and np.abs(sheet.corners - CORNERS).max() < 5
+
+
+def test_coloured_paper_is_found_on_a_grey_table() -> None:
+    photo = np.full((600, 800, 3), (154, 154, 150), dtype=np.uint8)
+    cv2.fillPoly(photo, [CORNERS.astype(np.int32)], (242, 228, 130))
+    sheet = find_sheet(photo)
+    assert sheet is not None and np.abs(sheet.corners - CORNERS).max() < 4
+
+
 def test_a_corner_may_lie_outside_of_the_photo() -> None:
     corners = CORNERS + [120, 0]
     sheet = find_sheet(photo_with(corners))
