@@ -70,9 +70,21 @@ class Workers:
         # The first one waits for the imports of the process that all are forked from.
         make = partial(_Process, self._context, self._threads)
         process = await asyncio.get_running_loop().run_in_executor(self._threads, make)
-        async for _ in process.answer():
-            pass
-        self._give(process)
+        try:
+            async for _ in process.answer():
+                pass
+        except Broken as error:
+            self._disappoint(error)
+        else:
+            self._give(process)
+
+    def _disappoint(self, error: Broken) -> None:
+        """Tell all who wait that there is nobody to wait for."""
+        for queue in self._waiting.values():
+            for future in queue:
+                if not future.done():
+                    future.set_exception(error)
+        self._waiting.clear()
 
     async def work(self, client: str, task: str, request: BaseModel) -> AsyncGenerator[bytes, None]:
         """Do some work, and yield its messages as JSON; when the iterator is closed early, the work is killed.

@@ -17,7 +17,7 @@ from pydantic import BaseModel
 
 from stackgen.studio import workers
 from stackgen.studio.requests import StackRequest
-from stackgen.studio.workers import MOST_WAITING, Busy, Refused, Workers
+from stackgen.studio.workers import MOST_WAITING, Broken, Busy, Refused, Workers
 
 REQUEST = StackRequest(file={})
 
@@ -122,6 +122,21 @@ def test_a_client_may_not_fill_the_queue(run: Callable[[Callable[[Workers], Any]
         Scripted.release.set()
         await asyncio.gather(*tasks, other)
         assert len(done) == MOST_WAITING + 2
+
+    run(test)
+
+
+def test_nobody_waits_for_a_process_that_cannot_begin(run: Callable[[Callable[[Workers], Any]], None]) -> None:
+    async def test(pool: Workers) -> None:
+        done: list[str] = []
+        tasks = [asyncio.create_task(ask(pool, name, name, done)) for name in ("working", "waiting")]
+        await asyncio.sleep(0.01)
+        pool._disappoint(Broken("it ended"))
+        with pytest.raises(Broken):
+            await tasks[1]
+        Scripted.release.set()
+        await tasks[0]
+        assert done == ["working"]
 
     run(test)
 
