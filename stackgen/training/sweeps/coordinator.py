@@ -205,9 +205,10 @@ def open_study(sweep: Sweep, folder: Path, seed: int = 0, parallel: int = 1) -> 
             pruner=_pruner(sweep),
             load_if_exists=True,
         )
+        known, _ = len(trials_of(study)), study.direction  # which are only now taken apart
     except Exception as error:
         raise StackgenError(f"{journal} is damaged: {error!r:.80}; choose another --out") from error
-    study.sampler = _sampler(sweep, seed, len(trials_of(study)), parallel)
+    study.sampler = _sampler(sweep, seed, known, parallel)
     return study
 
 

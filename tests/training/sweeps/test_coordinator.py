@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -201,7 +202,9 @@ def test_blanks_and_nuls_of_a_journal_are_mended(litter: bytes, program: Path, t
     assert states(tmp_path, sweep) == ["complete"] * 2
 
 
-@pytest.mark.parametrize("damage", ["half a line", "nonsense", "entry without meaning", "empty sweep", "half a sweep"])
+@pytest.mark.parametrize(
+    "damage", ["half a line", "nonsense", "entry without meaning", "no direction", "empty sweep", "half a sweep"]
+)
 def test_a_record_that_is_damaged_is_named(damage: str, program: Path, tmp_path: Path) -> None:
     sweep = sweep_of(program, run_cap=1)
     run_sweep(sweep, tmp_path, tell=lambda line: None)
@@ -211,6 +214,8 @@ def test_a_record_that_is_damaged_is_named(damage: str, program: Path, tmp_path:
         journal.write_bytes(b"".join([*lines[:2], lines[2][:20] + b"\n", *lines[3:]]))
     elif damage == "nonsense":
         journal.write_bytes(b"[1, 2]\n")
+    elif damage == "no direction":
+        journal.write_bytes(re.sub(rb'("directions": ?)\[\d\]', rb"\1[]", journal.read_bytes()))
     elif damage == "entry without meaning":
         journal.write_bytes(b'{"op_code": 0}\n')
     else:
