@@ -68,7 +68,7 @@ def options_of_verbs() -> Iterator[tuple[str, set[str]]]:
 
 def test_every_verb_that_reports_has_both_options() -> None:
     silent = {name for name, options in options_of_verbs() if not {"--json", "--quiet"} <= options}
-    assert silent <= {"fit", "validate", "completion", "sample"}
+    assert silent <= {"fit", "validate", "completion", "sample", "studio"}
 
 
 @pytest.mark.parametrize(("file", "code"), [(STAND, 0), (FALL, 1)], ids=["stands", "falls"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from stackgen.vision.masks import bounding_box, components, largest, smoothed, without_specks
+from stackgen.vision.masks import bounding_box, components, largest, near_parts, smoothed, without_specks
 
 
 def test_the_largest_component_bridges_small_gaps_only() -> None:
@@ -52,3 +52,11 @@ def test_a_median_filter_takes_away_what_is_thinner_than_half_its_size() -> None
     mask = np.zeros((30, 30), dtype=bool)
     mask[:, 3:5], mask[:, 15:25] = True, True
     assert np.flatnonzero(smoothed(mask, 5).any(axis=0)).tolist() == list(range(15, 25))
+
+
+def test_noise_has_no_more_than_some_parts() -> None:
+    dots = np.zeros((400, 400), dtype=bool)
+    dots[4::20, 4::20] = dots[5::20, 4::20] = dots[4::20, 5::20] = True
+    dots[100:110, 100:110] = True
+    found = near_parts(dots, 0.0)
+    assert len(found) == 30 and max(map(np.count_nonzero, found)) >= 100
