@@ -113,6 +113,10 @@ def scaled(figure: Mask, world: World, cells: float) -> Scaled:
     return Scaled(world, target, cells)
 
 
+LESS = 0.5
+"""Share of the effort for each scale of that for the scale before, which promised more."""
+
+
 def best_scale(
     figure: Mask,
     world: World,
@@ -139,10 +143,10 @@ def best_scale(
         figure = cv2.resize(figure.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
     began = time.perf_counter()
 
-    def answers(at: Scaled, wanted: int) -> tuple[Answer, ...]:
-        left = settings
+    def answers(at: Scaled, wanted: int, share: float = 1.0) -> tuple[Answer, ...]:
+        left = replace(settings, effort=settings.effort * share)
         if settings.seconds is not None:
-            left = replace(settings, seconds=max(settings.seconds - (time.perf_counter() - began), _LEAST))
+            left = replace(left, seconds=max(settings.seconds - (time.perf_counter() - began), _LEAST))
         return tuple(solve(at.target, at.world, wanted, block_list, inventory, left))
 
     tried: list[tuple[float, Scaled]] = []
@@ -150,7 +154,7 @@ def best_scale(
         late = settings.seconds is not None and time.perf_counter() - began > settings.seconds
         if tried and (late or promise < max(worth for worth, _ in tried) - SLACK):
             break
-        best = answers(at, 1)
+        best = answers(at, 1, LESS ** len(tried))
         worth = max((fine_iou(a, figure, at) - WORTH * len(a.stack) for a in best), default=-1.0)
         tried.append((worth, replace(at, answers=best)))
     chosen = max(tried, key=lambda one: one[0])[1]
