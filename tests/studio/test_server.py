@@ -147,7 +147,8 @@ def test_denoising_is_told_step_by_step(studio: TestClient) -> None:
 
 
 def test_a_table_is_tilted_up_to_the_margin_of_statics(studio: TestClient) -> None:
-    file = file_of(TOWER)
+    # Four cubes topple long before they slide, and what slides does not fall.
+    file = file_of([{"shape": "cube", "position": [0, 0, z]} for z in (0.5, 1.5, 2.5, 3.5)])
     margin = studio.post("/api/check", json={"file": file}).json()["statics"]["margin"]
     for degrees, stands in ((0.8 * margin, True), (1.2 * margin, False)):
         for direction in (0, 180, 90):
