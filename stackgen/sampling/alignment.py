@@ -2,39 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.protocols import StackSampler
+from stackgen.sampling.wrapped import WrappedSampler
 from stackgen.stack import Stack
 from stackgen.vision.drawings import grid_offset
-from stackgen.world import Mask, World
+from stackgen.world import Mask
 
 
 @dataclass(frozen=True)
-class AlignedSampler:
+class AlignedSampler(WrappedSampler):
     """A StackSampler that shows another each structure on the cells of its grid, and moves the answer back."""
 
     sampler: StackSampler
-
-    @property
-    def world(self) -> World:
-        """World of the other sampler."""
-        return self.sampler.world
-
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        """Settings of the other sampler."""
-        return self.sampler.settings
-
-    @property
-    def card(self) -> Mapping[str, Any]:
-        """Card of the other sampler."""
-        return self.sampler.card
 
     def sample_batch(
         self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int

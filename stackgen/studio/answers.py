@@ -1,6 +1,6 @@
 """Answers of the studio that take a while: work of another process, whose messages are sent on as they come.
 
-Whoever closes the connection cancels the work.
+Closing the connection cancels the work.
 """
 
 from __future__ import annotations

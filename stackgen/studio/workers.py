@@ -1,4 +1,4 @@
-"""Processes that do the heavy work, shared fairly: whoever asks takes turns, and what is cancelled is killed at once.
+"""Processes that do the heavy work, shared fairly: clients take turns, and what is cancelled is killed at once.
 
 A process is forked from one that has everything imported, so a new one is there in a moment.
 """
@@ -127,7 +127,7 @@ class Workers:
             raise
 
     def _give(self, process: _Process) -> None:
-        """Hand a process to whoever is next, or keep it."""
+        """Hand a process to the next client that waits, or keep it."""
         while self._waiting:
             client, queue = next(iter(self._waiting.items()))
             future = queue.popleft()

@@ -37,7 +37,7 @@ THIN_FACE = 0.035
 _SOLID = 1.3
 """Ink that holds a disc of so many widths of the stroke as its radius is filled in: two strokes side by side do not."""
 
-FINE = 360
+FINE = 420
 """Ink is filled at a scale at which the largest part is no larger than this [pixel]."""
 
 LOOSE = 0.3

@@ -1,4 +1,4 @@
-"""Stacks as plain data for whoever draws them in 3-D: the page of `stackgen show`, notebooks and the studio.
+"""Stacks as plain data for all that draws them in 3-D: the page of `stackgen show`, notebooks and the studio.
 
 Lengths in cells, z up; a pose is a position and a unit quaternion (x, y, z, w).
 """

@@ -1,4 +1,4 @@
-"""A drawing becomes stacks, and whoever watches sees how: noise that turns into structures, verdicts, and why.
+"""A drawing becomes stacks, and messages tell how: noise that turns into structures, verdicts, and why.
 
 The answer is that of `stackgen sample` for the picture of the drawing; :func:`command_line` says with which options.
 """
@@ -23,6 +23,7 @@ from stackgen.io.stacks_file import StacksFile, to_json
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.protocols import StackSampler
 from stackgen.sampling.verified import Budget
+from stackgen.sampling.wrapped import WrappedSampler
 from stackgen.stack import shapes_of
 from stackgen.studio.requests import GenerateRequest, ReadRequest, Wish
 from stackgen.studio.work.drawings import cells_high, mask_of, pack, picture_of, png, reading_of
@@ -31,7 +32,7 @@ from stackgen.studio.work.methods import BEST, methods
 from stackgen.vision.drawings import grid_offset
 from stackgen.vision.reader import Reading, read_picture
 from stackgen.viz.scene import quaternion_poses
-from stackgen.world import PAPER_GRID, Grid, Mask, World
+from stackgen.world import PAPER_GRID, Grid, Mask
 
 Send = Callable[[Message], None]
 
@@ -182,7 +183,7 @@ def _small(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 @dataclass
-class _Watched:
+class _Watched(WrappedSampler):
     """A StackSampler that tells what another draws, and how, the first time that it is asked.
 
     Args:
@@ -195,21 +196,6 @@ class _Watched:
     send: Send
     offset: int
     asked: bool = False
-
-    @property
-    def world(self) -> World:
-        """World of the sampler."""
-        return self.sampler.world
-
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        """Settings of the sampler."""
-        return self.sampler.settings
-
-    @property
-    def card(self) -> Mapping[str, Any]:
-        """Card of the sampler."""
-        return self.sampler.card
 
     def sample_batch(
         self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
