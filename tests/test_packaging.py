@@ -25,6 +25,11 @@ FILES = {
 }
 
 
+@pytest.mark.parametrize("name", ["index.html", "studio.css"])
+def test_the_committed_page_of_the_studio_is_that_of_its_source(name: str) -> None:
+    assert (ROOT / "stackgen" / "assets" / "studio" / name).read_bytes() == (ROOT / "studio" / name).read_bytes()
+
+
 def test_every_file_of_the_package_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     distribution = setuptools.Distribution({"script_name": "setup.py"})
