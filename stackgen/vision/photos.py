@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
 from stackgen.vision.images import Picture
-from stackgen.vision.lines import strong, without_rules
+from stackgen.vision.ink.rules import strong, without_rules
 from stackgen.vision.masks import components, extent, largest
 from stackgen.vision.sheets import FOCAL, Sheet, least_channel, straightened
 from stackgen.world import Mask

@@ -21,10 +21,10 @@ from stackgen.vision import depth, drawings, images
 from stackgen.vision.depth import DepthFrame
 from stackgen.vision.drawings import Look
 from stackgen.vision.images import Image8, Picture
-from stackgen.vision.lines import without_rules
+from stackgen.vision.ink.choice import choose
+from stackgen.vision.ink.rules import without_rules
 from stackgen.vision.masks import bounding_box, filling, place
 from stackgen.vision.options import PictureKind, PictureOptions
-from stackgen.vision.outlines import choose
 from stackgen.vision.photos import is_drawn_on, read_page, straight_up
 from stackgen.vision.sheets import Sheet, find_sheet
 from stackgen.world import Grid, Mask

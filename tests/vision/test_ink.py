@@ -8,7 +8,8 @@ import pytest
 
 from stackgen.errors import StackgenError
 from stackgen.geometry import iou
-from stackgen.vision.outlines import choose, fill
+from stackgen.vision.ink.choice import choose
+from stackgen.vision.ink.outlines import fill
 from stackgen.world import Mask
 
 ARCH = np.array([[100, 100], [400, 100], [400, 400], [300, 400], [300, 200], [200, 200], [200, 400], [100, 400]])

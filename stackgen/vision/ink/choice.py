@@ -1,0 +1,147 @@
+"""Which of all that is drawn is the structure: a name, a sun, a ground line are not, and two drawings are asked for.
+
+Legend: H x W pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from stackgen.errors import StackgenError
+from stackgen.vision.ink.ground import without_ground
+from stackgen.vision.ink.outlines import Filled, fill
+from stackgen.vision.masks import bounding_box, extent, is_round, largest, near_parts, rim
+from stackgen.world import Mask
+
+FINE = 420
+"""Ink is filled at a scale at which the largest part is no larger than this [pixel]."""
+
+RIVAL = 0.2
+"""A part of the picture is a drawing of its own from this share of the largest one's area on."""
+
+TOGETHER = 0.07
+"""What is nearer than this, by the size of the largest part, is one drawing."""
+
+_SURE = 0.8  # a drawing without any of its ground line counts from this sureness on
+_EDGE = 0.02  # what is nearer to the sheet's edge runs off it, by its longer edge
+_LEVEL = 0.06  # feet of one structure are level to within this, by its size
+
+
+def choose(
+    ink: Mask, which: int | None = None, spread: bool = False, framed: bool = True, beyond: Mask | None = None
+) -> Filled:
+    """Find the drawing among all that the ink (H, W) shows, and fill it.
+
+    A name, a sun, a ground line are left out.
+
+    Args:
+        ink: All that is drawn.
+        which: Number of the drawing, from the left; None where there is one.
+        spread: Whether what stands apart on the same ground is one structure, which may be cropped to its edges.
+        framed: Whether what runs off is left out, where something else is drawn.
+        beyond: (H, W) what of the sheet is not in the photo, into which drawings run off, too.
+
+    Raises:
+        StackgenError: If there are several drawings and none is asked for, fewer than asked for, or an outline is open.
+    """
+    edge = rim(ink.shape, round(_EDGE * max(ink.shape)))
+    if beyond is not None:
+        edge |= beyond
+    scale = FINE / max(extent(largest(ink, 0)), 1)
+    if scale >= 1:
+        return _chosen(ink, edge, which, spread, framed)
+    size = (round(ink.shape[1] * scale), round(ink.shape[0] * scale))
+    small = [cv2.resize(of.astype(np.float32), size, interpolation=cv2.INTER_AREA) for of in (ink, edge)]
+    found = _chosen(small[0] > 0.3, small[1] > 0.5, which, spread, framed)
+    mask = cv2.resize(found.mask.astype(np.float32), ink.shape[::-1], interpolation=cv2.INTER_LINEAR) >= 0.5
+    return replace(found, mask=np.asarray(mask), stroke=found.stroke / scale)
+
+
+def _chosen(ink: Mask, edge: Mask, which: int | None, spread: bool, framed: bool) -> Filled:
+    """Find the drawing in ink (H, W), as `choose` does, where what lies in `edge` (H, W) runs off."""
+    groups = near_parts(ink, TOGETHER)
+    found = [_one(group) for group in groups]
+    seen = list(zip(groups, found, strict=True))
+    if framed:
+        inner = [pair for pair in seen if not _at_edge(*pair, edge)]
+        seen = inner if not spread or _most(inner) > RIVAL * _most(seen) else seen
+    drawings = _that_can_be_read(seen, cut=len(seen) < len(found))
+    if not spread:
+        # A name is drawn near the structure, too: what is not right beside its largest part is left out.
+        drawings = [replace(one, mask=largest(one.mask, round(0.03 * extent(one.mask)))) for one in drawings]
+    most = max(np.count_nonzero(part.mask) for part in drawings)
+    rivals = [part for part in drawings if np.count_nonzero(part.mask) >= RIVAL * most]
+    rivals.sort(key=lambda part: bounding_box(part.mask)[1].start)
+    if which is not None:
+        if not 1 <= which <= len(rivals):
+            raise StackgenError(f"which must lie in 1..{len(rivals)}, the number of drawings there are, got {which}")
+        return rivals[which - 1]
+    main = max(drawings, key=lambda part: np.count_nonzero(part.mask))
+    beside = [part for part in drawings if part is not main and spread and _is_level(part.mask, main.mask)]
+    rivals = [part for part in rivals if not (part is main or part in beside or is_round(part.mask))]
+    if rivals:
+        raise StackgenError(
+            f"{len(rivals) + 1} drawings are in it; cover or crop all but one, or say which one counts, from the left"
+            " (--which 1)"
+        )
+    left_out = len(found) - 1 - len(beside)
+    notes = main.notes + (("What is drawn beside the structure was left out.",) if left_out else ())
+    mask = np.any([part.mask for part in (main, *beside)], axis=0)
+    return Filled(mask, main.stroke, notes, main.sureness * (0.95 if left_out else 1.0))
+
+
+def _that_can_be_read(seen: list[tuple[Mask, Filled | StackgenError]], cut: bool) -> list[Filled]:
+    """Return the drawings among groups of ink (H, W), where no larger one is open, or was cut off by the edge."""
+    drawings = [part for _, part in seen if isinstance(part, Filled)]
+    refused = {_width(group): part for group, part in seen if isinstance(part, StackgenError)}
+    if cut and (not seen or (not refused and all(is_round(part.mask) for part in drawings))):
+        raise StackgenError("the drawing runs off the sheet; leave some blank paper around it")
+    if refused and (not drawings or max(refused) > max(_width(part.mask) for part in drawings)):
+        raise refused[max(refused)]  # never a name beside an outline that is open
+    return drawings
+
+
+def _most(pairs: list[tuple[Mask, Filled | StackgenError]]) -> int:
+    """Return the area of the largest drawing [pixel]."""
+    return max((int(np.count_nonzero(part.mask)) for _, part in pairs if isinstance(part, Filled)), default=0)
+
+
+def _at_edge(group: Mask, part: Filled | StackgenError, edge: Mask) -> bool:
+    """Tell whether what was found in a group of ink (H, W) runs off the sheet, as drawings may and the table does."""
+    mask = part.mask if isinstance(part, Filled) else group
+    return bool(np.count_nonzero(mask & edge) > 2 * _EDGE * max(mask.shape))
+
+
+def _width(mask: Mask) -> int:
+    """Return the lesser edge of a mask's box, which is small for a line [pixel]."""
+    return min(mask[bounding_box(mask)].shape)
+
+
+def _one(group: Mask) -> Filled | StackgenError:
+    """Fill one group of ink, without the ground line under it; the error if its outline is open."""
+    note = "The ground line was left out."
+    bodies = [filled for filled in map(_filled, without_ground(group)) if filled is not None]
+    most = max((np.count_nonzero(filled.mask) for filled in bodies), default=0)
+    sure = [filled for filled in bodies if filled.sureness > _SURE and np.count_nonzero(filled.mask) > 0.75 * most]
+    if bodies:
+        chosen = sure[0] if sure else max(bodies, key=lambda filled: filled.sureness)
+        return replace(chosen, notes=(*chosen.notes, note))
+    try:
+        return fill(group)
+    except StackgenError as error:
+        return error
+
+
+def _filled(ink: Mask) -> Filled | None:
+    try:
+        return fill(ink)
+    except StackgenError:
+        return None
+
+
+def _is_level(part: Mask, main: Mask) -> bool:
+    """Tell whether two parts (H, W) stand on one ground."""
+    return abs(bounding_box(part)[0].stop - bounding_box(main)[0].stop) <= _LEVEL * extent(main)
