@@ -15,7 +15,7 @@ from stackgen.io.provenance import cores
 
 
 def main(
-    data: Path,
+    data: Path | list[Path],
     out: Path,
     weights: str = "default",
     scenes: int = 4000,
@@ -27,13 +27,14 @@ def main(
     """Sample for training scenes, simulate, and pair each failure with a stack of the same blocks that stands.
 
     Args:
-        data: Dataset whose training split gives the scenes.
+        data: Dataset whose training split gives the scenes, or a list of datasets.
         out: File for the pairs, a .npz; `stackgen fit --config configs/model/ddpm-verdicts.yaml` learns from it.
         weights: Weights of the sampler that is to learn: a name, a .safetensors file, a .ckpt or a run folder.
         scenes: Number of scenes drawn from the training split.
         num_samples: Number of stacks sampled for each scene.
         seed: Seed of the scenes, stacks and pairs; the same seed gives the same pairs.
-        iou: Least IoU of a success: it stands, and its settled silhouette matches the target this well.
+        iou: Least match of a success: it stands, and its settled silhouette has this share of the IoU with the target
+            that the dataset's own stack has, which is 1 unless the target is a drawing.
         workers: Number of processes that simulate; by default one for each core.
     """
     from stackgen.data.dataset import Dataset
@@ -46,7 +47,10 @@ def main(
         raise StackgenError("--scenes, --num_samples and --workers must be at least 1, --seed at least 0")
     if out.suffix != ".npz":
         raise StackgenError(f"--out must be a .npz file, not {out.name}")
-    dataset, loaded = Dataset.open(data), load_method(Method(weights))
+    datasets = [Dataset.open(path) for path in (data if isinstance(data, list) else [data])]
+    dataset, loaded = Dataset.join(datasets), load_method(Method(weights))
+    if any(one.manifest.physics != dataset.manifest.physics for one in datasets):
+        raise StackgenError("--data: the datasets were made under different physics; choose those of one")
     require_one_world(loaded, dataset.world, dataset.manifest.name)
     train = dataset.split("train")
     chosen = np.random.default_rng(seed).choice(len(train), min(scenes, len(train)), replace=False)
@@ -74,6 +78,7 @@ COMMAND = Command(
     main,
     """
     stackgen prefer --data data/paper --weights runs/ours --out data/verdicts.npz
+    stackgen prefer --data '[data/drawings, data/paper]' --weights runs/taught-small --out data/verdicts.npz
     stackgen fit --config configs/model/ddpm-verdicts.yaml --data.path data/paper
     """,
     reports=True,

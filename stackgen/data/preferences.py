@@ -101,7 +101,8 @@ def prefer(
         stacks: Stacks of the training split, of the sampler's world.
         num_samples: Samples for each stack, n.
         seed: The same seed gives the same pairs.
-        iou: Least match of a success: it stands, and its settled front silhouette has this IoU with the target.
+        iou: Least match of a success: it stands, and its settled front silhouette has this share of the IoU that
+            the dataset's own stack has with the target, which is 1 unless the target is a drawing.
         progress: Called with the number of scenes done.
 
     Raises:
@@ -120,14 +121,16 @@ def prefer(
         for row, target, drawn in zip(part.tolist(), targets, samples, strict=True):
             successes: list[NDArray[np.float64]] = []
             failures: list[NDArray[np.float64]] = []
+            truth = _truth(stacks, row)
+            least = iou * silhouette_iou(drawn[0].with_poses(truth), target, sampler.world.grid)
             for stack in drawn:
                 verdict = next(verdicts)
-                good = verdict.stable and silhouette_iou(verdict.settled, target, sampler.world.grid) >= iou
+                good = verdict.stable and silhouette_iou(verdict.settled, target, sampler.world.grid) >= least
                 (successes if good else failures).append(stack.poses)
             for poses in failures:
                 own = bool(successes) and rng.random() < 0.5
                 rows.append(row)
-                better.append(successes[rng.integers(len(successes))] if own else _truth(stacks, row))
+                better.append(successes[rng.integers(len(successes))] if own else truth)
                 worse.append(poses)
         progress(min(start + _SCENES_AT_ONCE, len(order)))
     if not rows:

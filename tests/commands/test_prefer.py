@@ -27,6 +27,18 @@ def test_failures_are_paired_with_stacks_that_stand(
     assert 1 <= len(Preferences.load(tmp_path / "pairs.npz")) <= 2
 
 
+def test_scenes_of_several_datasets(cli: Cli, tiny: TinyWeights, towers_dataset: Path, tmp_path: Path) -> None:
+    options = ["--weights", tiny.sampler, "--workers", 1, "--scenes", 1, "--out", tmp_path / "pairs.npz"]
+    both = f"[{towers_dataset}, {towers_dataset}]"
+    assert cli("prefer", "--data", both, *options).code == 0
+
+    other = shutil.copytree(towers_dataset, tmp_path / "slippery")
+    content = json.loads((other / "dataset.json").read_text())
+    content["physics"]["friction"] = 0.25
+    (other / "dataset.json").write_text(json.dumps(content))
+    assert "different physics" in cli("prefer", "--data", f"[{towers_dataset}, {other}]", *options).line
+
+
 def test_stacks_fall_as_they_do_in_the_world_of_the_dataset(
     cli: Cli, tiny: TinyWeights, towers_dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +80,13 @@ def test_each_failure_is_paired_with_a_success_of_its_scene(arrays: StackArrays,
     for row in range(len(pairs)):  # the stacks and the picture are of one scene
         scene = np.flatnonzero((arrays.silhouettes == pairs.better.silhouettes[row]).all(axis=1))[0]
         assert (np.sort(arrays.shapes[scene]) == pairs.better.shapes[row]).all()
+
+
+def test_a_drawing_is_matched_as_well_as_its_own_stack_matches_it(arrays: StackArrays) -> None:
+    taller = np.roll(arrays.images(), -7, axis=1) | arrays.images()  # by half a cell, which no stack of these can be
+    drawings = replace(arrays, silhouettes=np.packbits(taller.reshape(len(taller), -1), axis=1))
+    pairs = prefer(EveryThirdFails(drawings), OnTheGround(), drawings, num_samples=3, iou=0.95)
+    assert len(pairs) == len(drawings)  # the lifted ones alone have failed
 
 
 def test_pairs_come_back_from_a_file(pairs: Preferences, tmp_path: Path) -> None:
