@@ -2,7 +2,7 @@
 import { build } from "esbuild";
 import { copyFile } from "node:fs/promises";
 
-const out = "../stackgen/assets/studio";
+const out = process.argv[2] ?? "../stackgen/assets/studio";
 await build({
   entryPoints: { studio: "src/main.ts" },
   outdir: out,

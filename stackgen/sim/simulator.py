@@ -7,7 +7,7 @@ rollout depends on the stack alone: not on what was simulated before, nor on the
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from types import TracebackType
 from typing import Protocol
@@ -84,6 +84,23 @@ class Rollout:
         return self.start.poses[:, 2] - self.end.poses[:, 2]
 
 
+@dataclass(frozen=True)
+class Pull:
+    """Forces on the centres of mass of blocks that grow, and are then held.
+
+    Args:
+        forces: Gives the force on each block at a time [s], (k, 3), as a share of its weight.
+        seconds: Time until which they grow [s].
+    """
+
+    forces: Callable[[float], Floats]
+    seconds: float
+
+    def ordered(self, order: NDArray[np.int64]) -> Pull:
+        """The same forces on blocks in another order."""
+        return Pull(lambda time: self.forces(time)[order], self.seconds)
+
+
 class Simulator:
     """Simulates stacks under one physics.
 
@@ -105,7 +122,7 @@ class Simulator:
         until_fall: bool = False,
         until_moved: float = np.inf,
         record_every: int = 0,
-        pull: Floats | None = None,
+        pull: Pull | None = None,
     ) -> Rollout:
         """Spawn a stack at its poses and watch it until it rests or the watch is over.
 
@@ -114,13 +131,14 @@ class Simulator:
             until_fall: End as soon as a block fell: enough for a verdict, and much faster.
             until_moved: End as soon as a block moved further than this from its start [cell].
             record_every: Keep every n-th step's poses in the trajectory; 0 keeps none.
-            pull: (k, 3) force on the centre of mass of each block all the while, as a share of its weight.
+            pull: Forces beside gravity; the watch begins when they are held.
         """
         if self._engine is None:
             self._engine = open_engine(self._scaled)
         order = np.lexsort((*stack.poses.T, stack.shapes))  # the order of the blocks must not matter
         shapes = [stack.catalogue[shape] for shape in stack.shapes[order]]
-        watch = _Watch(self._engine, self._scaled, shapes, stack.poses[order], None if pull is None else pull[order])
+        ordered = None if pull is None else pull.ordered(order)
+        watch = _Watch(self._engine, self._scaled, shapes, stack.poses[order], ordered)
         poses, at_rest, steps, frames = watch.run(until_fall, until_moved, record_every)
         back = np.argsort(order)
         trajectory = np.array([frame[back] for frame in frames]) if record_every else None
@@ -143,13 +161,13 @@ class _Watch:
     """One stack in an engine: metres there, cells here."""
 
     def __init__(
-        self, engine: Engine, physics: Physics, shapes: Sequence[Shape], poses: Floats, pull: Floats | None
+        self, engine: Engine, physics: Physics, shapes: Sequence[Shape], poses: Floats, pull: Pull | None
     ) -> None:
-        self.engine, self.physics, self.start = engine, physics, poses
-        weights = (
+        self.engine, self.physics, self.start, self.pull = engine, physics, poses, pull
+        self.grown = 0 if pull is None else round(pull.seconds / physics.step)  # step from which forces are held
+        self.weights = (
             np.array([shape.volume for shape in shapes]) * physics.density * physics.cell_size**3 * physics.gravity
         )
-        self.forces = None if pull is None else pull * weights[:, None]
         self.com = np.array([shape.center_of_mass for shape in shapes]).reshape(-1, 3)  # in the block frame [cell]
         turned = quaternions(poses[:, 3:])
         engine.put(shapes, (poses[:, :3] + self._arms(turned)) * physics.cell_size, turned)
@@ -161,7 +179,7 @@ class _Watch:
         look = max(1, window // 5)
         frames = [self.start] if record_every else []
         start = anchor = self._states()
-        anchor_step = 0
+        anchor_step = self.grown
         # Until a coordinate of a centre of mass or of a quaternion changed by this much, no block can have moved
         # far enough: turning by an angle changes the quaternion's length by at least a quarter of it.
         arm = np.linalg.norm(self.com, axis=1).max(initial=0)
@@ -179,18 +197,22 @@ class _Watch:
                 if moved > until_moved or (until_fall and sank > physics.fall_height):
                     return poses, False, step, frames
             if np.abs(state - anchor).max(initial=0) > physics.rest_motion:
-                anchor, anchor_step = state, step
+                anchor, anchor_step = state, max(step, self.grown)
             elif step - anchor_step >= window:
                 return self._poses(state), True, step, frames
         return self._poses(self._states()), False, step, frames
 
     def _pass_time(self, look: int, record_every: int) -> Iterator[int]:
         """Let the watch pass; stop where it is looked at or recorded, and at its end. Yield the number of steps."""
-        step, last = 0, max(1, round(self.physics.watch / self.physics.step))
+        step, last = 0, self.grown + max(1, round(self.physics.watch / self.physics.step))
         while step < last:
             stop = min(last, *((step // every + 1) * every for every in (look, record_every) if every))
-            self.engine.step(stop - step, self.forces)
+            self.engine.step(stop - step, self._forces(step * self.physics.step))
             yield (step := stop)
+
+    def _forces(self, time: float) -> Floats | None:
+        """Give the forces (k, 3) [N] at a time [s]."""
+        return None if self.pull is None else self.pull.forces(time) * self.weights[:, None]
 
     def _states(self) -> Floats:
         """Read centres of mass [cell] and quaternions, (k, 7)."""

@@ -112,23 +112,28 @@ class StackRequest(Request):
 
 
 class TiltRequest(StackRequest):
-    """A stack on a table that is tilted."""
+    """A stack on a table that is tilted slowly, until a block falls.
+
+    Args:
+        degrees: Tilt at which it stops.
+        direction: Direction from above in which the table dips: 0 to the right, 90 away from the viewer.
+    """
 
     degrees: float = Field(ge=0, le=60, allow_inf_nan=False)
     direction: float = Field(default=0, ge=-360, le=360, allow_inf_nan=False)
 
 
 class PushRequest(StackRequest):
-    """A stack, one block of which is pushed at its centre of mass.
+    """A stack, one block of which is pushed at its centre of mass, harder and harder, until a block falls.
 
     Args:
         block: Number of the block.
-        force: Horizontal force, as a share of the block's weight.
+        force: Horizontal force beyond which it does not grow, as a share of the block's weight.
         direction: Direction from above: 0 to the right, 90 away from the viewer.
     """
 
     block: int = Field(ge=0, le=999)
-    force: float = Field(ge=0, le=20, allow_inf_nan=False)
+    force: float = Field(ge=0, le=5, allow_inf_nan=False)
     direction: float = Field(default=0, ge=-360, le=360, allow_inf_nan=False)
 
 

@@ -1,10 +1,12 @@
-"""One HTML page that shows stacks in 3-D."""
+"""One HTML page that shows stacks in 3-D: the studio's own, with stacks in it instead of a server behind it."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from functools import cache
 from html import escape
+from importlib.resources import files
 from pathlib import Path
 
 from stackgen.errors import StackgenError
@@ -13,7 +15,25 @@ from stackgen.protocols import Verdict
 from stackgen.stack import Stack
 from stackgen.viz.scene import scene
 
-_VIEWER = Path(__file__).with_name("viewer.html")
+_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; script-src 'unsafe-inline'; style-src \
+'unsafe-inline'; img-src data: blob:">
+<title>{title}</title>
+<style>
+{style}</style>
+</head>
+<body>
+<script type="application/json" id="stacks">{data}</script>
+<script type="module">
+{script}</script>
+</body>
+</html>
+"""
 _FRAME = "width: 100%; height: 420px; border: 1px solid #d5d9e1; border-radius: 8px"
 
 
@@ -43,7 +63,12 @@ def html_page(stacks: Sequence[Stack], verdicts: Sequence[Verdict | None] | None
         raise StackgenError("a page needs at least one stack, all of one catalogue, and as many verdicts as stacks")
     data = {"title": title, **scene(stacks, known)}
     safe = json.dumps(data, allow_nan=False).replace("<", "\\u003c")  # nothing in it can end the script
-    return _VIEWER.read_text(encoding="utf-8").replace("/*DATA*/null", safe)
+    return _PAGE.format(title=escape(title), style=_asset("studio.css"), data=safe, script=_asset("studio.js"))
+
+
+@cache
+def _asset(name: str) -> str:
+    return files("stackgen").joinpath("assets/studio", name).read_text(encoding="utf-8")
 
 
 def notebook_html(

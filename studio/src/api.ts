@@ -1,6 +1,6 @@
 // Asks the server. A request that is aborted is cancelled there at once.
 
-const client = crypto.randomUUID();
+const client = Array.from(crypto.getRandomValues(new Uint8Array(8)), (byte) => byte.toString(16)).join("-");
 
 /** What the server refused, in its sentence. */
 export class Refused extends Error {}

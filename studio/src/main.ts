@@ -1,13 +1,14 @@
-// The page: drawing and wishes on one side, what becomes of them on the other.
+// The page: drawing and wishes on one side, what becomes of them on the other. Where a page holds stacks, it shows them.
 
 import { get, told } from "./api";
-import { byId, el } from "./dom";
+import { byId, copied, el } from "./dom";
 import { preset } from "./draw/presets";
 import { Sketchpad } from "./draw/sketchpad";
 import { Gallery } from "./gallery";
 import { linkTo, recall, remember } from "./memory";
 import { Pictures } from "./pictures";
 import { DEFAULTS, SettingsForm } from "./settings";
+import { show } from "./shown";
 import type { Start } from "./types";
 import { Pane } from "./view/pane";
 
@@ -55,8 +56,7 @@ async function begin(): Promise<void> {
   byId("link").addEventListener("click", async () => {
     const link = linkTo({ drawing: pad.drawing, settings });
     history.replaceState(null, "", link);
-    await navigator.clipboard?.writeText(link).catch(() => undefined);
-    byId("link-told").textContent = "The link is in the address bar, and copied.";
+    byId("link-told").textContent = (await copied(link)) ? "The link is in the address bar, and copied." : "The link is in the address bar.";
   });
   const gallery = new Gallery((title, file, stacks, shapes) => {
     turn("studio");
@@ -96,4 +96,14 @@ function themes(changed: () => void): void {
   changed();
 }
 
-begin().catch((error) => byId("panes").replaceChildren(el("p", { class: "error", role: "alert" }, told(error))));
+async function open(): Promise<void> {
+  const stacks = document.getElementById("stacks");
+  try {
+    if (stacks) show(JSON.parse(stacks.textContent!));
+    else await begin();
+  } catch (error) {
+    (document.getElementById("panes") ?? document.body).replaceChildren(el("p", { class: "error", role: "alert" }, told(error)));
+  }
+}
+
+void open();

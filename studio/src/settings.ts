@@ -88,7 +88,8 @@ export class SettingsForm {
     const both = [this.method(settings.method), this.method(settings.compared)].filter((m) => m !== undefined);
     const steps = Math.max(0, ...both.map((m) => m.steps ?? 0));
     const rows: HTMLElement[] = [
-      el("div", { class: "fields" }, labelled("Method", method), labelled("Beside it", compared)),
+      labelled("Method", method),
+      labelled("Beside it", compared),
       this.blocks(set),
       el("div", { class: "fields" }, labelled("Structures", number), labelled("Seed", seed)),
     ];

@@ -38,6 +38,12 @@ export interface Rollout extends Clip {
   seconds: number;
 }
 
+export interface Disturbed extends Rollout {
+  reached: number; // tilt or push that was held in the end
+  growth: number; // of it in a second
+  fell_at: number | null;
+}
+
 export interface Statics {
   stable: boolean;
   margin: number;

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stackgen.geometry import mirror, tilt
 from stackgen.sim.physics import Physics
-from stackgen.sim.simulator import Rollout, Simulator
+from stackgen.sim.simulator import Pull, Rollout, Simulator
 from stackgen.stack import Stack
 from stackgen.world import PAPER_CATALOGUE, Catalogue, Shape
 from tests.sim.engines import ENGINES
@@ -278,10 +278,12 @@ def test_a_pull_slides_a_block_where_it_exceeds_friction_and_a_tilt_is_a_pull_on
     simulator: Simulator, share: float
 ) -> None:
     flat = Stack(np.array([2, 0]), np.array([[0, 0, 0.5, 0, 0, 0], [0, 5, 0.5, 0, 0, 0]]))  # too flat to tip
-    rollout = simulator.rollout(flat, pull=np.array([[share, 0, 0], [0, 0, 0]]))
+    forces = np.array([[share, 0, 0], [0, 0, 0]])
+    rollout = simulator.rollout(flat, pull=Pull(lambda time: forces * min(1, time / 0.5), 0.5))  # at rest at first
+    assert rollout.time > 0.5
     moved = np.linalg.norm(rollout.end.poses[:, :3] - flat.poses[:, :3], axis=1)
     assert (moved[0] > 0.5) == (share > simulator.physics.friction)
     assert moved[1] < 0.01
     angle = np.arctan(share)
-    tilted = simulator.rollout(flat, pull=np.tile([np.sin(angle), 0, 1 - np.cos(angle)], (2, 1)))
+    tilted = simulator.rollout(flat, pull=Pull(lambda time: np.tile([np.sin(angle), 0, 1 - np.cos(angle)], (2, 1)), 0))
     assert (np.abs(tilted.end.poses[0, 0]) > 0.5) == (share > simulator.physics.friction)

@@ -146,14 +146,22 @@ def test_denoising_is_told_step_by_step(studio: TestClient) -> None:
     assert noise[-1, 0, :, :3] == pytest.approx(np.array(messages[-2]["frames"][0])[:, :3], abs=2e-3)
 
 
-def test_a_table_is_tilted_up_to_the_margin_of_statics(studio: TestClient) -> None:
+def test_a_tower_on_a_tilted_table_falls_where_statics_says(studio: TestClient) -> None:
     # Four cubes topple long before they slide, and what slides does not fall.
     file = file_of([{"shape": "cube", "position": [0, 0, z]} for z in (0.5, 1.5, 2.5, 3.5)])
     margin = studio.post("/api/check", json={"file": file}).json()["statics"]["margin"]
-    for degrees, stands in ((0.8 * margin, True), (1.2 * margin, False)):
-        for direction in (0, 180, 90):
-            asked = {"file": file, "degrees": degrees, "direction": direction}
-            assert studio.post("/api/tilt", json=asked).json()["stable"] is stands
+    below = studio.post("/api/tilt", json={"file": file, "degrees": 0.9 * margin}).json()
+    assert below["stable"] and below["fell_at"] is None and below["reached"] == 0.9 * margin
+    above = studio.post("/api/tilt", json={"file": file, "degrees": 45, "direction": 90}).json()
+    assert not above["stable"] and above["first"] == 3
+    assert above["fell_at"] == pytest.approx(margin, abs=1)
+    assert above["fell_at"] <= above["reached"] < margin + 4  # where the hand stops
+
+
+def test_a_push_fells_the_block_that_friction_no_longer_holds(studio: TestClient) -> None:
+    answer = studio.post("/api/push", json={"file": file_of(TOWER), "block": 1, "force": 1}).json()
+    assert answer["fell"] == [1]
+    assert answer["fell_at"] == pytest.approx(0.5, abs=0.05)
 
 
 def test_what_leans_falls_and_is_explained(studio: TestClient) -> None:

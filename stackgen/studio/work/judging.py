@@ -18,7 +18,7 @@ from stackgen.io.stacks_file import StackEntry, StacksFile, from_json
 from stackgen.protocols import Verdict
 from stackgen.sim.checkers import judged
 from stackgen.sim.physics import Physics
-from stackgen.sim.simulator import Rollout, Simulator
+from stackgen.sim.simulator import Pull, Rollout, Simulator
 from stackgen.sim.statics.checker import StaticsChecker
 from stackgen.stack import Stack
 from stackgen.studio.requests import MOST_BLOCKS, PushRequest, StackRequest, TiltRequest
@@ -30,7 +30,14 @@ Message = dict[str, Any]
 FRAMES = 60
 """Frames of a rollout in a second."""
 
-_BEGUN = 0.1  # distance from its start at which a block has begun to fall [cell]
+TILTED = 10.0
+"""How fast the table tilts [degree/s]."""
+
+PUSHED = 0.5
+"""How fast a push grows [weight of the block/s]."""
+
+_GONE = 0.1  # distance from its start at which a block has left its place [cell]
+_STILL = 0.1  # speed below which it has not begun to move [cell/s]
 _MOST_STACKS = 100  # of a file that is sent
 
 
@@ -45,6 +52,7 @@ class Recorder:
     def __init__(self, physics: Physics, on_check: Callable[[Verdict], None] = lambda verdict: None) -> None:
         self.physics = physics
         self.rollouts: list[Rollout] = []
+        self.every = round(1 / FRAMES / physics.step)
         self._simulator, self._on_check = Simulator(physics), on_check
 
     def check(self, stack: Stack) -> Verdict:
@@ -58,9 +66,9 @@ class Recorder:
         """Give the verdicts on many stacks, in order."""
         return [self.check(stack) for stack in stacks]
 
-    def rollout(self, stack: Stack, pull: NDArray[np.float64] | None = None) -> Rollout:
+    def rollout(self, stack: Stack, pull: Pull | None = None, until_fall: bool = False) -> Rollout:
         """Watch a stack, and record it."""
-        return self._simulator.rollout(stack, record_every=round(1 / FRAMES / self.physics.step), pull=pull)
+        return self._simulator.rollout(stack, until_fall=until_fall, record_every=self.every, pull=pull)
 
     def behind(self, stack: Stack) -> Rollout:
         """Find how a stack came to lie as it does: the rollout that ended with it, or began with it, or a new one."""
@@ -106,12 +114,25 @@ def rollout_facts(rollout: Rollout, physics: Physics) -> Message:
 
 def first_to_go(rollout: Rollout, verdict: Verdict) -> int | None:
     """Find the block of those that fell which left its place first; None where none fell."""
-    if verdict.stable or rollout.trajectory is None:
+    if verdict.stable:
         return None
+    return int(np.where(verdict.fell, _left(rollout), np.inf).argmin())
+
+
+def _left(rollout: Rollout) -> NDArray[np.int64]:
+    """Find the frame (k,) in which each block has left its place, or the number of frames."""
+    assert rollout.trajectory is not None
     path = rollout.trajectory[..., :3]
-    gone = np.linalg.norm(path - path[0], axis=-1) > _BEGUN
-    when = np.where(gone.any(axis=0), gone.argmax(axis=0), len(path))
-    return int(np.where(verdict.fell, when, len(path) + 1).argmin())
+    gone = np.linalg.norm(path - path[0], axis=-1) > _GONE
+    return np.where(gone.any(axis=0), gone.argmax(axis=0), len(path))
+
+
+def _held_until(rollout: Rollout, block: int) -> int:
+    """Find the last frame in which a block that fell had not begun to move."""
+    assert rollout.trajectory is not None
+    path = rollout.trajectory[: _left(rollout)[block] + 1, block, :3]
+    still = np.linalg.norm(np.diff(path, axis=0), axis=-1) * FRAMES < _STILL
+    return int(np.flatnonzero(still).max(initial=-1)) + 1
 
 
 def statics_facts(stack: Stack, physics: Physics) -> Message:
@@ -161,38 +182,60 @@ def chosen_stack(request: StackRequest) -> tuple[StacksFile, StackEntry]:
 
 
 def tilted(request: TiltRequest, send: Callable[[Message], None]) -> None:
-    """Tilt the table under a stack: gravity turns, as seen from the table."""
-    angle, towards = math.radians(request.degrees), math.radians(request.direction)
-    along = math.sin(angle)
-    pull = np.array([along * math.cos(towards), along * math.sin(towards), 1 - math.cos(angle)])
-    _disturbed(request, send, lambda k: np.tile(pull, (k, 1)))
+    """Tilt the table under a stack, slowly, until a block falls: gravity turns, as seen from the table."""
+    towards = math.radians(request.direction)
+
+    def forces(k: int, degrees: float) -> NDArray[np.float64]:
+        angle = math.radians(degrees)
+        along = math.sin(angle)
+        return np.tile([along * math.cos(towards), along * math.sin(towards), 1 - math.cos(angle)], (k, 1))
+
+    _disturbed(request, send, forces, request.degrees, TILTED)
 
 
 def pushed(request: PushRequest, send: Callable[[Message], None]) -> None:
-    """Push one block of a stack all the while.
+    """Push one block of a stack, harder and harder, until a block falls.
 
     Raises:
         StackgenError: If there is no such block.
     """
     towards = math.radians(request.direction)
 
-    def pull(k: int) -> NDArray[np.float64]:
+    def forces(k: int, force: float) -> NDArray[np.float64]:
         if request.block >= k:
             raise StackgenError(f"block must lie in 0..{k - 1}, got {request.block}")
-        forces = np.zeros((k, 3))
-        forces[request.block, :2] = request.force * math.cos(towards), request.force * math.sin(towards)
-        return forces
+        shares = np.zeros((k, 3))
+        shares[request.block, :2] = force * math.cos(towards), force * math.sin(towards)
+        return shares
 
-    _disturbed(request, send, pull)
+    _disturbed(request, send, forces, request.force, PUSHED)
 
 
 def _disturbed(
-    request: StackRequest, send: Callable[[Message], None], pull: Callable[[int], NDArray[np.float64]]
+    request: StackRequest,
+    send: Callable[[Message], None],
+    forces: Callable[[int, float], NDArray[np.float64]],
+    most: float,
+    rate: float,
 ) -> None:
+    """Let something grow at a rate, up to the most of it or until a block falls, and hold it there."""
     content, entry = chosen_stack(request)
-    physics = physics_of(content)
-    rollout = Recorder(physics).rollout(entry.stack, pull(len(entry.stack)))
-    send({"shapes": entry.stack.shapes.tolist(), **rollout_facts(rollout, physics)})
+    physics, k = physics_of(content), len(entry.stack)
+    recorder = Recorder(physics)
+
+    def up_to(amount: float, until_fall: bool) -> Rollout:
+        pull = Pull(lambda time: forces(k, min(amount, rate * time)), amount / rate)
+        return recorder.rollout(entry.stack, pull, until_fall)
+
+    rollout, reached, fell_at = up_to(most, until_fall=True), most, None
+    verdict = judged(rollout, physics)
+    if not verdict.stable:
+        first, frame = first_to_go(rollout, verdict) or 0, rate * recorder.every * physics.step
+        fell_at = round(min(most, frame * _held_until(rollout, first)), 2)
+        reached = min(most, frame * int(_left(rollout)[first]))  # the hand that sees it go stops there
+        rollout = up_to(reached, until_fall=False)
+    facts = {"reached": reached, "growth": rate, "fell_at": fell_at}
+    send({"shapes": entry.stack.shapes.tolist(), **rollout_facts(rollout, physics), **facts})
 
 
 def checked(request: StackRequest, send: Callable[[Message], None]) -> None:

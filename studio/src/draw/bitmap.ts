@@ -49,6 +49,12 @@ export class Bitmap {
     this.fill(value, (x, y) => y > top && y < bottom && Math.abs(x - middle) < ((right - left) / 2) * ((y - top) / (bottom - top)));
   }
 
+  ellipse(value: 0 | 1, a: Point, b: Point): void {
+    const [middleX, middleY] = [(a.x + b.x) / 2, (a.y + b.y) / 2];
+    const [halfX, halfY] = [Math.abs(a.x - b.x) / 2, Math.abs(a.y - b.y) / 2];
+    this.fill(value, (x, y) => Math.hypot((x - middleX) / halfX, (y - middleY) / halfY) < 1);
+  }
+
   line(value: 0 | 1, a: Point, b: Point, width: number): void {
     const length = Math.hypot(b.x - a.x, b.y - a.y);
     this.fill(value, (x, y) => {

@@ -4,7 +4,7 @@ import { button, choice, el, labelled } from "../dom";
 import { Bitmap, CELL, type Point } from "./bitmap";
 import { PRESETS, preset } from "./presets";
 
-const TOOLS = { brush: "Brush", eraser: "Eraser", rectangle: "Rectangle", triangle: "Triangle" } as const;
+const TOOLS = { brush: "Brush", eraser: "Eraser", rectangle: "Rectangle", triangle: "Triangle", ellipse: "Circle" } as const;
 type Tool = keyof typeof TOOLS;
 
 const SNAPS: Record<string, number> = { cells: CELL, half: CELL / 2, free: 1 };
@@ -118,10 +118,9 @@ export class Sketchpad {
     const to = this.at(event);
     const step = SNAPS[this.snap]!;
     const value = held.erase ? 0 : 1;
-    if (this.tool === "rectangle" || this.tool === "triangle") {
+    if (this.tool !== "brush" && this.tool !== "eraser") {
       this.drawing = held.before.copy();
-      const [a, b] = spanned(held.from, to, step);
-      this.drawing[held.erase ? "rectangle" : this.tool](value, a, b);
+      this.drawing[this.tool](value, ...spanned(held.from, to, step));
     } else {
       const drawing = this.drawing === held.before ? this.drawing.copy() : this.drawing;
       if (step === 1) drawing.line(value, held.last, to, this.width);

@@ -32,7 +32,11 @@ export class Building {
   private stack: StackFacts | null = null;
   private place = 0;
 
-  constructor(private readonly stage: Stage) {
+  /** @param begins Called before the stage is used. */
+  constructor(
+    private readonly stage: Stage,
+    private readonly begins: () => void,
+  ) {
     this.order.addEventListener("input", () => void this.showOrder());
     this.speed = choice([["1", "real time"], ["4", "4 times"], ["12", "12 times"]], "4", (value) => {
       if (this.arm) this.stage.player.speed = Number(value);
@@ -77,6 +81,7 @@ export class Building {
         this.placing = found.order;
       }
       const placed = this.placing.slice(0, Number(this.order.value));
+      this.begins();
       this.stage.still();
       this.stage.world.pose(stack.poses);
       this.stage.world.mark([], (block) => !placed.includes(block));
@@ -94,8 +99,9 @@ export class Building {
     this.starts = [];
     const clip: Clip & { joints: number[][] } = { frames: [], joints: [], rate: 12 };
     const { stage } = this;
-    stage.world.tilt(0, 0);
-    stage.setMarks(null);
+    this.begins();
+    stage.still();
+    stage.say("planning …", "busy");
     let played: Promise<void> | null = null;
     let [stands, last] = ["", false];
     try {

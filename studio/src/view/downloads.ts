@@ -1,7 +1,7 @@
 // What can be taken away: files, and the command line that makes the same again.
 
 import { postForFile, told } from "../api";
-import { button, bytesOf, download, el } from "../dom";
+import { button, bytesOf, copied, download, el } from "../dom";
 import type { Message } from "../types";
 import type { World } from "./world";
 
@@ -29,6 +29,6 @@ export function downloads(result: Extract<Message, { kind: "file" }>, stack: num
   if (result.picture) row.append(button("silhouette.png", () => offer("silhouette.png", () => new Blob([bytesOf(result.picture)], { type: "image/png" }))));
   row.append(status);
   if (!result.command) return row;
-  const copy = button("Copy", () => void navigator.clipboard.writeText(result.command), { "aria-label": "Copy the command" });
+  const copy = button("Copy", async () => (status.textContent = (await copied(result.command)) ? "Copied." : "This browser does not let it be copied: mark it instead."), { "aria-label": "Copy the command" });
   return el("div", {}, row, el("p", { class: "hint" }, "The same on the command line, beside silhouette.png:"), el("div", { class: "command" }, el("code", {}, result.command), copy));
 }

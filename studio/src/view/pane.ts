@@ -8,7 +8,7 @@ import { Disturbances } from "./disturb";
 import { downloads } from "./downloads";
 import { explain } from "./marks";
 import { overlays } from "./overlays";
-import { Stage } from "./stage";
+import { Stage, type Told } from "./stage";
 import { why } from "./why";
 
 const EXPLAINED_AFTER = 1500; // [ms] after a fall
@@ -19,7 +19,7 @@ export class Pane {
   readonly stage: Stage;
   private readonly title = el("h3");
   private readonly state = el("p", { class: "state", role: "status" });
-  private readonly tabs = el("div", { class: "tabs", role: "tablist", "aria-label": "Structures" });
+  private readonly tabs = el("div", { class: "tabs", role: "group", "aria-label": "Structures" });
   private readonly facts = el("div", { class: "facts" });
   private readonly disturbances: Disturbances;
   private readonly building: Building;
@@ -39,11 +39,11 @@ export class Pane {
     this.stage = new Stage(start.shapes, `Structure ${number}`);
     this.shapes = start.shapes;
     this.disturbances = new Disturbances(this.stage);
-    this.building = new Building(this.stage);
+    this.building = new Building(this.stage, () => this.disturbances.reset());
     this.stage.world.onPick = (block) => this.disturbances.choose(block);
     const explosion = el("input", { type: "range", min: 0, max: 1.5, step: 0.01, value: 0, "aria-label": "Explode" });
     explosion.addEventListener("input", () => this.stage.world.explode(Number(explosion.value)));
-    const home = button("Front view", () => this.show(this.shown, false));
+    const home = button("Reset the view", () => this.stage.world.home());
     const again = button("Drop it again", () => void this.drop());
     this.tools = el(
       "div",
@@ -154,18 +154,19 @@ export class Pane {
 
   private add({ number, ...stack }: Extract<Message, { kind: "stack" }>): void {
     this.stacks.push(stack);
-    const match = stack.stable ? stack.front_iou?.toFixed(2) : "falls";
-    const text = match ? `${number + 1} · ${match}` : `${number + 1}`;
+    const match = stack.front_iou === null ? "" : ` · IoU ${stack.front_iou.toFixed(2)}`;
+    const text = `${number + 1}${stack.stable ? match : " · falls"}`;
     const verdict = stack.stable ? "stands" : "falls";
-    const tab = button(text, () => this.choose(number), { role: "tab", class: verdict, "aria-selected": "false", "aria-label": `Structure ${number + 1}, ${verdict}` });
+    const tab = button(text, () => this.choose(number), { class: verdict, "aria-pressed": "false", "aria-label": `Structure ${number + 1}, ${verdict}` });
     this.tabs.append(tab);
   }
 
   private choose(number: number): void {
     if (!this.stacks.length || !this.file) return;
-    this.show(number, true);
-    [...this.tabs.children].forEach((tab, i) => tab.setAttribute("aria-selected", String(i === number)));
+    this.shown = number;
+    [...this.tabs.children].forEach((tab, i) => tab.setAttribute("aria-pressed", String(i === number)));
     const stack = this.stacks[number]!;
+    this.stage.present(stack.shapes, stack.frames[0]!);
     const size = this.file.file.grid.image_size;
     this.facts.replaceChildren(
       ...this.file.notes.map((note) => el("p", { class: "note" }, note)),
@@ -175,39 +176,33 @@ export class Pane {
     this.building.take(this.file.file, number, stack);
     this.disturbances.take(this.file.file, number, stack, this.shapes.map((shape) => shape.name));
     this.tools.hidden = false;
+    void this.drop();
   }
 
-  private show(number: number, drop: boolean): void {
-    this.shown = number;
-    const stack = this.stacks[number];
-    if (!stack) return;
-    this.stage.present(stack.shapes, stack.frames[0]!);
-    this.disturbances.reset();
-    this.building.reset();
-    if (drop) void this.drop();
-    else this.stage.world.pose(stack.frames.at(-1)!);
-  }
-
-  /** Switches gravity on. */
+  /** Switches gravity on; what falls is explained a moment later. */
   private async drop(): Promise<void> {
     const stack = this.stacks[this.shown]!;
+    const told = verdictOn(stack);
     this.disturbances.reset();
     this.building.reset();
-    this.stage.say("gravity on", "busy");
-    await this.stage.playRollout(stack);
+    await this.stage.playRollout(stack, told);
     this.element.dataset.done = "";
     if (stack.stable && !this.weights.checked) return;
     await new Promise((resolve) => setTimeout(resolve, stack.stable ? 0 : EXPLAINED_AFTER));
-    if (stack === this.stacks[this.shown] && !this.stage.player.playing) this.markWeights();
+    if (this.stage.told === told && !this.stage.player.playing) this.markWeights();
   }
 
   private markWeights(): void {
     const stack = this.stacks[this.shown];
     if (!stack) return;
+    this.disturbances.reset();
+    this.building.reset();
     const marked = this.weights.checked || !stack.stable;
-    if (marked) this.stage.still();
-    if (marked && stack.first !== null) this.stage.world.mark([stack.first]);
+    this.stage.holdRollout(stack, verdictOn(stack), !marked);
     this.stage.setMarks(marked ? explain(stack.statics) : null);
-    this.stage.say(stack.stable ? "stands" : "falls", stack.stable ? "stands" : "falls");
   }
+}
+
+function verdictOn({ stable, first }: StackFacts): Told {
+  return { during: "gravity on", verdict: stable ? "stands" : "falls", stable, red: first === null ? [] : [first] };
 }

@@ -2,11 +2,21 @@
 
 import * as three from "three";
 import { button, el } from "../dom";
-import type { Clip, Pose, Rollout, Shape } from "../types";
+import type { Clip, Pose, Shape } from "../types";
 import { Player } from "./player";
 import { World } from "./world";
 
 const SLOT = 5.5; // distance of stacks side by side [cell]
+
+export type Tone = "" | "stands" | "falls" | "busy";
+
+/** What the badge says of a clip, and which blocks light up: while it plays nothing but what goes on. */
+export interface Told {
+  during: string;
+  verdict: string;
+  stable: boolean;
+  red: number[];
+}
 
 export class Stage {
   readonly element: HTMLElement;
@@ -15,7 +25,9 @@ export class Stage {
   private readonly badge = el("p", { class: "badge", role: "status" });
   private readonly seekBar = el("input", { type: "range", min: 0, max: 1, step: 0.001, value: 0, "aria-label": "Moment" });
   private readonly playButton = button("Play", () => this.player.toggle(), { disabled: true });
+  onMoment: (time: number) => void = () => {}; // of the clip [s]
   private marks: three.Object3D | null = null;
+  told: Told | null = null;
 
   constructor(shapes: Shape[], name: string) {
     this.world = new World(shapes);
@@ -28,18 +40,17 @@ export class Stage {
   }
 
   /** Shows a word over the picture. */
-  say(text: string, kind: "" | "stands" | "falls" | "busy" = ""): void {
-    this.badge.textContent = text;
-    this.badge.className = `badge ${kind}`;
+  say(text: string, tone: Tone = ""): void {
+    if (this.badge.textContent !== text) this.badge.textContent = text;
+    this.badge.className = `badge ${tone}`;
   }
 
   /** Shows several stacks of the same blocks side by side; the frames hold the poses of each. */
   arrange(shapes: number[], number: number): (stacks: Pose[][]) => Pose[] {
     const across = Math.min(4, number);
     const down = Math.ceil(number / across);
+    this.still();
     this.world.setBlocks(Array.from({ length: number }, () => shapes).flat());
-    this.world.tilt(0, 0);
-    this.setMarks(null);
     this.world.home(across * SLOT * 0.95, 4 + down);
     const place = (i: number) => [((i % across) - (across - 1) / 2) * SLOT, (Math.floor(i / across) - (down - 1) / 2) * SLOT] as const;
     return (stacks) =>
@@ -48,32 +59,42 @@ export class Stage {
 
   /** Shows one stack. */
   present(shapes: number[], poses: Pose[]): void {
-    this.player.clip = { frames: [], rate: 1 };
     this.world.setBlocks(shapes);
-    this.setMarks(null);
+    this.still();
+    this.player.clip = { frames: [], rate: 1 };
     const extent = (axis: number) => Math.max(...poses.map((pose) => Math.abs(pose[axis]!)), 1) + 1;
     this.world.home(2 * extent(0), extent(2));
     this.world.pose(poses);
   }
 
   async playClip(clip: Clip, more = false): Promise<void> {
-    this.playButton.disabled = false;
     await this.player.play(clip, more);
   }
 
-  /** Plays what the simulator saw, and shows at its end which block went first. */
-  async playRollout(rollout: Rollout): Promise<void> {
-    this.world.mark([]);
-    this.setMarks(null);
-    await this.playClip(rollout);
-    this.world.mark(rollout.first === null ? [] : [rollout.first]);
-    this.say(rollout.stable ? "stands" : "falls", rollout.stable ? "stands" : "falls");
+  /** Plays what the simulator saw; when it stops, the badge tells the verdict. */
+  async playRollout(clip: Clip, told: Told): Promise<void> {
+    this.still();
+    this.told = told;
+    await this.playClip(clip);
   }
 
-  /** Stops, and shows the beginning. */
+  /** Shows the beginning or the end of a rollout, and its verdict. */
+  holdRollout(clip: Clip, told: Told, end: boolean): void {
+    this.still();
+    this.told = told;
+    this.player.clip = clip;
+    this.player.seek(end ? this.player.duration : 0);
+  }
+
+  /** Stops, and shows the beginning on a level table, without a verdict. */
   still(): void {
+    this.told = null;
+    this.onMoment = () => {};
+    this.say("");
     this.player.seek(0);
     this.world.mark([]);
+    this.world.tilt(0, 0);
+    this.setMarks(null);
   }
 
   setMarks(marks: three.Object3D | null): void {
@@ -86,6 +107,12 @@ export class Stage {
   private moved(): void {
     const { time, duration, playing } = this.player;
     this.seekBar.value = String(duration ? time / duration : 0);
+    this.playButton.disabled = !duration;
     this.playButton.textContent = playing ? "Pause" : "Play";
+    this.onMoment(time);
+    if (!this.told) return;
+    const { during, verdict, stable, red } = this.told;
+    this.world.mark(playing ? [] : red);
+    this.say(playing ? during : verdict, playing ? "busy" : stable ? "stands" : "falls");
   }
 }

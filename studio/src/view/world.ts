@@ -22,9 +22,14 @@ export class World {
   private explosion = 0;
   private asked = false;
   private last = 0;
+  private size: [number, number] = [4, 4]; // of what is looked at [cell]
 
   constructor(shapes: Shape[]) {
-    this.renderer = new three.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
+    try {
+      this.renderer = new three.WebGLRenderer({ antialias: true, preserveDrawingBuffer: true });
+    } catch {
+      throw new Error("This browser shows no 3-D graphics (WebGL).");
+    }
     this.renderer.setPixelRatio(Math.min(2, devicePixelRatio));
     this.renderer.shadowMap.enabled = true;
     this.renderer.shadowMap.type = three.PCFShadowMap;
@@ -111,8 +116,9 @@ export class World {
     this.paint();
   }
 
-  /** Looks from the front at something of this size. */
-  home(width: number, height: number): void {
+  /** Looks from the front at something of this size; by default at what was looked at last. */
+  home(width: number = this.size[0], height: number = this.size[1]): void {
+    this.size = [width, height];
     const size = Math.max(width, height, 2);
     this.controls.target.set(0, 0, height * 0.45);
     const aspect = Math.min(1, this.camera.aspect);
