@@ -226,14 +226,23 @@ def _otsu(values: Differences) -> float:
 
 
 def _without_rim(mask: Mask) -> Mask:
-    """Remove thin lines along the mask's edges (H, W), which are not of one colour or not quite straight."""
+    """Remove thin lines along the mask's edges (H, W), which are not of one colour or not quite straight.
+
+    The side of an outline that is cropped to it is none: without it, what it outlines is open.
+    """
     kept = mask.copy()
     for turns in range(4):
         side = np.rot90(kept, turns)  # a view: what is removed from it is removed from the mask
         shares = side[: max(2, round(2 * _BORDER * len(side)))].mean(axis=1)
         if shares[0] > 0.85 and np.median(shares[len(shares) // 2 :]) < 0.5:
             side[: int(np.argmax(shares < 0.5)) + 1] = False
-    return kept
+    return mask if 1.5 * _enclosed(kept) < _enclosed(mask) < 0.97 * mask.size else kept
+
+
+def _enclosed(mask: Mask) -> int:
+    """Return how many pixels are set (H, W) or enclosed by what is."""
+    blank, _ = components(np.pad(~mask, 1, constant_values=True), connectivity=4)
+    return int(np.count_nonzero(blank != blank[0, 0]))
 
 
 def _clean(mask: Mask) -> Mask:

@@ -32,6 +32,8 @@ LARGEST = 1200
 SMALLEST = 8
 """Least edge of a picture, and of the structure in it [pixel]."""
 
+_LARGE = 400  # dots of a palette in larger pictures may be two pixels apart
+
 _MOST_PIXELS = 90_000_000
 
 
@@ -162,7 +164,7 @@ def _of_image(image: Image) -> Raster:
     if image.mode not in ("L", "RGB") or "transparency" in image.info:
         image = image.convert("RGBA")  # the numbers of a palette cannot be averaged
     if dithered:
-        image = image.filter(ImageFilter.BoxBlur(2))
+        image = image.filter(ImageFilter.BoxBlur(2 if min(image.size) > _LARGE else 1))
     factor = max(1, max(image.size) // LARGEST)
     reduced = image.reduce(factor) if factor > 1 else image
     if reduced.mode != "RGBA":

@@ -40,7 +40,17 @@ _HELD = np.radians([25.0, 8.0, 12.0])
 _STRAY = np.radians(2.0)
 """How far a hand turns a side that is as long as the drawing [rad]."""
 
-_DARKER_THAN_SHADOW = 0.33  # share of the light of the paper
+_DARKER_THAN_SHADOW = 0.33  # share of the light of the paper beside it
+
+_SLIT = 5  # what is lighter between the strokes of a hatch is narrower than this,
+
+_STEP = 7  # a border is sharp where light changes within this [both pixels of the sheet at half its size]
+
+_SHARP = 0.28  # by this logarithm
+
+_INK_TELLS = 0.3  # what ink tells of what is beside it, by what paper does: inks have many colours
+
+_LEAST_REGION = 40  # what is smaller is part of a border [pixel at half the size]
 
 _COLOURED = 1.25  # largest by least channel of paper from which on it is coloured
 
@@ -120,33 +130,92 @@ def find_ink(sheet: Picture) -> tuple[Mask, NDArray[np.float32]]:
     strokes = darkness > max(FAINTEST, 4 * grain)
     around = cv2.dilate(darkness, np.ones((11, 11), np.uint8))
     strokes &= darkness > 0.35 * around
-    solid, depth = _solids(np.asarray(paper))
+    solid, depth = _solids(np.asarray(light))
     darkness = np.where(solid, np.maximum(darkness, depth), darkness)
     return strokes | solid, np.clip(darkness, 0, 1).astype(np.float32)
 
 
-def _solids(paper: NDArray[np.uint8]) -> tuple[Mask, NDArray[np.float32]]:
-    """Find what is filled in (H, W): large, dark, with a sharp border, and not running off the sheet."""
-    flat = paper[::2, ::2]
-    base = float(np.quantile(flat[::2, ::2], 0.9))
-    found = np.zeros(flat.shape, dtype=bool)
-    low = cv2.erode(flat, np.ones((7, 7), np.uint8)).astype(np.float32)
-    high = cv2.dilate(flat, np.ones((7, 7), np.uint8)).astype(np.float32)
-    step = low < 0.75 * high
-    for share in np.arange(0.8, 0.15, -0.08):
-        labels, areas = components(flat < share * base, connectivity=4)
-        ends = (labels[:2], labels[-2:], labels[:, :2], labels[:, -2:])
-        at_edge = np.bincount(np.concatenate([end.ravel() for end in ends]), minlength=len(areas))
-        for number in np.flatnonzero((areas > 0.002 * flat.size) & (areas < 0.7 * flat.size)):
-            part = labels == number
-            inside = at_edge[number] <= 0.1 * np.sqrt(areas[number]) or share < _DARKER_THAN_SHADOW
-            if inside and not found[part].all():
-                border = part & (cv2.erode(part.astype(np.uint8), np.ones((3, 3), np.uint8)) == 0)
-                if step[border].mean() > 0.85:
-                    found |= part
-    full = cv2.resize(found.astype(np.uint8), paper.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
-    full &= paper < 0.85 * base
-    return np.asarray(full), np.where(full, 1 - paper / base, 0).astype(np.float32)
+def _solids(light: NDArray[np.uint8]) -> tuple[Mask, NDArray[np.float32]]:
+    """Find what is filled in or hatched (H, W): darker than the paper across a sharp border, and not running off it.
+
+    Sharp borders divide the sheet into regions. Light that changes slowly divides nothing, so a shadow that falls over
+    paper and ink makes no regions; one with a sharp border makes regions of paper that go on to the sheet's edge.
+
+    Returns:
+        The mask, and by which share of the light it is darker than the paper nearest to it.
+    """
+    half = cv2.resize(light, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    even = cv2.morphologyEx(cv2.medianBlur(half, 5), cv2.MORPH_OPEN, np.ones((_SLIT, _SLIT), np.uint8))
+    levels = np.log(even.astype(np.float32) + 8)
+    reach = np.ones((_STEP, _STEP), np.uint8)
+    low = np.asarray(cv2.erode(levels, reach), np.float32)
+    labels, areas = components(cv2.dilate(levels, reach) - low < _SHARP, connectivity=4)
+    labels[(areas < _LEAST_REGION)[labels]] = 0
+    if not labels.any():
+        return np.zeros(light.shape, bool), np.zeros(light.shape, np.float32)
+    nearest = _nearest(labels > 0)
+    regions, here = labels.ravel()[nearest], levels.ravel()[nearest]
+    steps, lengths = _borders(regions, here, low, len(areas))
+    ends = np.concatenate([end.ravel() for end in (regions[:2], regions[-2:], regions[:, :2], regions[:, -2:])])
+    runs_off = np.bincount(ends, minlength=len(areas)) > 0.2 * np.sqrt(areas)
+    paper = runs_off & ((steps * lengths).sum(axis=1) >= np.log(_DARKER_THAN_SHADOW) * lengths.sum(axis=1))
+    paper[areas.argmax()] = True
+    ink = _darker(steps, lengths, paper)[regions]
+    depth = np.where(ink, 1 - np.exp(here - here.ravel()[_nearest(~ink)]), 0)
+    found = cv2.resize(np.stack([ink, depth], 2).astype(np.float32), light.shape[::-1])
+    return np.asarray(found[..., 0] > 0.5), np.asarray(found[..., 1])
+
+
+def _nearest(mask: Mask) -> NDArray[np.int64]:
+    """Return the number of the pixel nearest to each one (H, W) of those that are set."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~mask).astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(int(labels.max()) + 1, np.int64)
+    of_label[labels[mask]] = np.flatnonzero(mask)
+    return np.asarray(of_label[labels])
+
+
+def _borders(
+    regions: NDArray[np.int32], levels: NDArray[np.float32], low: NDArray[np.float32], count: int
+) -> tuple[Floats, Floats]:
+    """Compare regions that touch; those with a stroke between them do not.
+
+    Args:
+        regions: (H, W) number of the region at each pixel.
+        levels: (H, W) logarithm of the light in it beside its border.
+        low: (H, W) least logarithm of the light around each pixel.
+        count: Number of regions R.
+
+    Returns:
+        (R, R) by how much one is lighter than another across their border, and (R, R) how long that is [pixel].
+    """
+    steps, lengths = np.zeros(count * count), np.zeros(count * count)
+    for one, two in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
+        for here, there in ((one, two), (two, one)):
+            stroke = low[here] < np.minimum(levels[here], levels[there]) - _SHARP / 2
+            differs = (regions[here] != regions[there]) & ~stroke
+            pairs = regions[here][differs].astype(np.int64) * count + regions[there][differs]
+            steps += np.bincount(pairs, (levels[here] - levels[there])[differs], count * count)
+            lengths += np.bincount(pairs, minlength=count * count)
+    return (steps / np.maximum(lengths, 1)).reshape(count, count), lengths.reshape(count, count)
+
+
+def _darker(steps: Floats, lengths: Floats, paper: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Tell which regions (R,) are ink: darker than the paper they touch, and no lighter than the ink.
+
+    Args:
+        steps: (R, R) by how much one is lighter than another.
+        lengths: (R, R) length of their border [pixel].
+        paper: (R,) which are paper for sure.
+    """
+    known, ink = paper.copy(), np.zeros(len(paper), bool)
+    while (touching := np.where(known, 0, lengths @ known)).any():
+        one = int(touching.argmax())
+        told = np.where(known, lengths[one], 0) * np.where(ink, _INK_TELLS, 1)
+        darker = steps[one] < np.where(ink, _SHARP / 2, -_SHARP / 2)
+        ink[one], known[one] = told[darker].sum() > told.sum() / 2, True
+    return ink
 
 
 def _clear_edge(ink: Mask, corners: Floats, turn: Floats) -> None:

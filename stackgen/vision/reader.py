@@ -51,6 +51,9 @@ _LEFT_OUT = 0.05
 _CLEAR = 0.9
 """Share of each side along which a sheet is seen in a picture that otherwise is a drawing of two tones."""
 
+_FULL = 0.85
+"""Share of a picture from which on a structure that touches all its edges may be the ground."""
+
 _ROOM = 0.25
 """What a structure of known size may be larger than the grid [cell]."""
 
@@ -207,11 +210,17 @@ def _of_drawing(image: Image8, grid: Grid, which: int | None, look: Look, insist
     found = choose(ink, which, spread=True, framed=not look.flat)
     if not insisted and not found.stroke and drawn.drawn_on(found.mask):
         raise StackgenError(_UNCLEAR)
-    sure = found.sureness * (0.8 if drawn.notes else 1.0)
+    notes = drawn.notes
+    if found.mask.mean() > _FULL and found.mask[bounding_box(found.mask)].shape == found.mask.shape:
+        notes = (
+            *notes,
+            "The structure fills nearly the whole picture, so what is ground is uncertain.",
+        )
+    sure = found.sureness * (0.8 if notes else 1.0)
     to_picture = np.array([[1 / drawn.scale, 0, drawn.place[0]], [0, 1 / drawn.scale, drawn.place[1]], [0, 0, 1]])
     overlay = _outlined(image.colours, found.mask, to_picture)
     exact = drawings.as_it_is(image, grid)
-    return Reading(_figure(found.mask), "drawing", sure, overlay, (*drawn.notes, *found.notes), exact=exact)
+    return Reading(_figure(found.mask), "drawing", sure, overlay, (*notes, *found.notes), exact=exact)
 
 
 def _of_photo(image: Image8, sheet: Sheet | None, which: int | None, even: bool, insisted: bool) -> Reading:

@@ -12,7 +12,7 @@ import numpy as np
 
 from stackgen.errors import StackgenError
 from stackgen.vision.ink.ground import without_ground
-from stackgen.vision.ink.outlines import Filled, fill
+from stackgen.vision.ink.outlines import Filled, fill, loose
 from stackgen.vision.masks import bounding_box, extent, is_round, largest, near_parts, rim
 from stackgen.world import Mask
 
@@ -25,8 +25,10 @@ RIVAL = 0.2
 TOGETHER = 0.07
 """What is nearer than this, by the size of the largest part, is one drawing."""
 
-_SURE = 0.8  # a drawing without any of its ground line counts from this sureness on
+_SURE = 0.82  # a drawing without any of its ground line counts from this share of the sureness with it on,
+_ALIKE = 0.02  # and where no more of its strokes enclose nothing than with it, but for this share
 _EDGE = 0.02  # what is nearer to the sheet's edge runs off it, by its longer edge
+_APART = 0.03  # what is further from its largest part is beside it, half of that where it is solid, by its size
 _LEVEL = 0.06  # feet of one structure are level to within this, by its size
 
 
@@ -71,7 +73,10 @@ def _chosen(ink: Mask, edge: Mask, which: int | None, spread: bool, framed: bool
     drawings = _that_can_be_read(seen, cut=len(seen) < len(found))
     if not spread:
         # A name is drawn near the structure, too: what is not right beside its largest part is left out.
-        drawings = [replace(one, mask=largest(one.mask, round(0.03 * extent(one.mask)))) for one in drawings]
+        drawings = [
+            replace(one, mask=largest(one.mask, round((_APART if one.stroke else _APART / 2) * extent(one.mask))))
+            for one in drawings
+        ]
     most = max(np.count_nonzero(part.mask) for part in drawings)
     rivals = [part for part in drawings if np.count_nonzero(part.mask) >= RIVAL * most]
     rivals.sort(key=lambda part: bounding_box(part.mask)[1].start)
@@ -122,13 +127,14 @@ def _width(mask: Mask) -> int:
 
 def _one(group: Mask) -> Filled | StackgenError:
     """Fill one group of ink, without the ground line under it; the error if its outline is open."""
-    note = "The ground line was left out."
-    bodies = [filled for filled in map(_filled, without_ground(group)) if filled is not None]
-    most = max((np.count_nonzero(filled.mask) for filled in bodies), default=0)
-    sure = [filled for filled in bodies if filled.sureness > _SURE and np.count_nonzero(filled.mask) > 0.75 * most]
+    inks = without_ground(group)
+    bodies = [filled for filled in map(_filled, inks) if filled is not None]
     if bodies:
-        chosen = sure[0] if sure else max(bodies, key=lambda filled: filled.sureness)
-        return replace(chosen, notes=(*chosen.notes, note))
+        surest = max(filled.sureness for filled in bodies)
+        sure = [filled for filled in bodies if filled.sureness > _SURE * surest]
+        left = [loose(inks[0], filled.mask, filled.stroke) for filled in sure]
+        chosen = next(filled for filled, of in zip(sure, left, strict=True) if of <= min(left) + _ALIKE)
+        return replace(chosen, notes=(*chosen.notes, "The ground line was left out."))
     try:
         return fill(group)
     except StackgenError as error:

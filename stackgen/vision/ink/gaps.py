@@ -11,14 +11,17 @@ import numpy as np
 from stackgen.vision.masks import closed, components, opened
 from stackgen.world import Mask
 
+HAIR = 0.018
+"""Half the width of what is no part of something solid, at most, by the size of the drawing."""
+
 HATCH = 0.02
 """Half of what lies between the strokes of a hatch, at most, by the size of the drawing."""
 
 
 def without_whiskers(mask: Mask, size: int) -> Mask:
     """Remove what is thin as a hair from something solid: lines of the paper that touch it."""
-    core = opened(mask, 0.01 * size)
-    near = cv2.distanceTransform((~core).astype(np.uint8), cv2.DIST_L2, 3) <= 0.01 * size
+    core = opened(mask, HAIR * size)
+    near = cv2.distanceTransform((~core).astype(np.uint8), cv2.DIST_L2, 3) <= HAIR * size
     return np.asarray(near & mask) if core.any() else mask
 
 
@@ -26,10 +29,8 @@ def hatched(ink: Mask, size: int) -> Mask:
     """Close hatches: strokes so dense that what they cover is solid; other ink stays as it is."""
     dense = closed(ink, HATCH * size)
     solid = opened(dense, 0.05 * size)
-    hatched = np.count_nonzero(solid) > 0.5 * np.count_nonzero(dense) and np.count_nonzero(
-        ink
-    ) > 0.4 * np.count_nonzero(dense)
-    return dense if hatched else ink
+    of_dense = np.array([np.count_nonzero(part) for part in (solid, ink)]) / np.count_nonzero(dense)
+    return ink | solid if (of_dense > [0.5, 0.4]).all() else ink
 
 
 def bridged(ink: Mask, reach: float) -> Mask:

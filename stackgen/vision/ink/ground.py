@@ -12,6 +12,9 @@ from numpy.typing import NDArray
 from stackgen.vision.masks import bounding_box, extent, largest
 from stackgen.world import Mask
 
+_NEAR = 0.06  # the line's two ends are level to within this, by the size of all the ink
+_EXPLAINED = 0.75  # least share of the ink that is the ground line or stands on it
+
 
 def without_ground(ink: Mask) -> list[Mask]:
     """Remove a ground line: thin, nearly level, under the drawing, and longer than it.
@@ -23,8 +26,9 @@ def without_ground(ink: Mask) -> list[Mask]:
     body, foot = _off_ground(ink)
     if foot is None:
         return []
-    body, again = _off_ground(body)  # beyond a drawing that is filled in the line is found anew
-    foot = again or foot
+    more, again = _off_ground(body)  # beyond a drawing that is filled in the line is found anew
+    if again is not None and again[0].stop > foot[0].stop - _NEAR * extent(ink):
+        body, foot = more, again
     under = body.copy()
     under[:, foot[1]] = ink[:, foot[1]]
     return [body, under]
@@ -46,9 +50,16 @@ def _off_ground(ink: Mask) -> tuple[Mask, tuple[slice, slice] | None]:
         body = _only(body, foot)  # what else the line touches, such as the margin of ruled paper, is no part of it
         long = np.count_nonzero(path >= 0) > 1.04 * (foot[1].stop - foot[1].start)
         below = foot[0].stop - 1 <= np.median(path[path >= 0]) + 0.06 * size
-        if long and below and body.sum() > 0.3 * ink.sum():
+        if long and below and body.sum() > 0.3 * ink.sum() and _is_all(ink, body, path, width):
             return body, foot
     return ink, None
+
+
+def _is_all(ink: Mask, body: Mask, path: NDArray[np.int64], width: float) -> bool:
+    """Tell whether a body and the line along a path (W,) are nearly all of the ink: no blocks lie below the ground."""
+    off = np.abs(np.arange(len(ink))[:, None] - path)
+    line = ink & (path >= 0) & (off <= 2 * width)
+    return bool(np.count_nonzero(body | line) > _EXPLAINED * np.count_nonzero(ink))
 
 
 def _only(mask: Mask, box: tuple[slice, slice]) -> Mask:

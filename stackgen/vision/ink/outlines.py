@@ -40,6 +40,10 @@ _SOLID = 1.3
 LOOSE = 0.3
 """Share of the strokes that may enclose nothing before an outline counts as open."""
 
+_NONE = 0.015  # share of them that is none: the sides of one block of many, between two others, are more,
+
+_NEARLY = 0.94  # as is that block's share of what is enclosed
+
 
 @dataclass(frozen=True, eq=False)
 class Filled:
@@ -130,14 +134,17 @@ def _told(trial: _Trial, note: str, sureness: float) -> Filled:
 
 
 def _least_gap(ink: Mask, size: int) -> _Trial:
-    """Close the smallest gaps by which most is enclosed that any enclose."""
-    trials = []
+    """Close the smallest gaps by which nearly all is enclosed that is where the fewest strokes enclose nothing."""
+    trials: list[_Trial] = []
     for gap in GAPS:
         trials.append(_trial(ink, size, gap))
-        if gap == GAPS[0] and trials[0].loose < 0.05:
+        if trials[0].loose < _NONE:
             return trials[0]
     enough = [trial for trial in trials if trial.enclosed >= 0.6 * max(trial.enclosed for trial in trials)]
-    return next(trial for trial in enough if trial.loose <= min(other.loose for other in enough) + 0.1)
+    least = min(trial.loose for trial in enough)
+    best = next(trial for trial in enough if trial.loose <= least + _NONE)
+    alike = [trial for trial in enough if trial.enclosed >= _NEARLY * best.enclosed and trial.loose <= least + 0.1]
+    return alike[0]
 
 
 def _trial(ink: Mask, size: int, gap: float) -> _Trial:
@@ -155,10 +162,10 @@ def _trial(ink: Mask, size: int, gap: float) -> _Trial:
     if stroke:
         whole |= opened(drawn, _SOLID * stroke)
     enclosed = int(faces.areas[large].sum())
-    return _Trial(whole, stroke, _loose(faces.ink, whole, stroke), gap, enclosed, doors)
+    return _Trial(whole, stroke, loose(faces.ink, whole, stroke), gap, enclosed, doors)
 
 
-def _loose(ink: Mask, whole: Mask, stroke: float) -> float:
+def loose(ink: Mask, whole: Mask, stroke: float) -> float:
     """Return the share of the strokes that bound nothing of the whole."""
     if not stroke:
         return 0.0 if opened(ink, 0.5 * STROKE * extent(ink)).sum() > 0.3 * ink.sum() else 1.0
