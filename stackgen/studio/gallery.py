@@ -1,4 +1,4 @@
-"""The results that lie on this machine: stacks files, pictures and tables below one folder.
+"""The results that lie on this machine: stacks files, pictures, tables and reports below one folder.
 
 A request names an item by an identifier that a listing made; no text of a request becomes a path.
 """
@@ -7,19 +7,24 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import unquote
 
 from stackgen.errors import StackgenError
 from stackgen.io.stacks_file import read_stacks, to_json
 from stackgen.io.text import read_json, read_text
+from stackgen.studio.markdown import markdown_page
 from stackgen.viz.scene import shape_meshes
 
-Kind = Literal["stacks", "picture", "table"]
+Kind = Literal["stacks", "picture", "table", "report", "page"]
+"""A report is Markdown; a page is HTML, which may hold scripts."""
 
 MOST_ITEMS = 600
 _MOST_FOLDERS = 4000
@@ -27,7 +32,7 @@ _DEEPEST = 6
 _MOST_BYTES = 16_000_000
 _MOST_ROWS = 200
 _SKIPPED = {"node_modules", "site-packages", "__pycache__", "wandb", "tests"}
-_KINDS: dict[str, Kind] = {".png": "picture", ".csv": "table"}
+_KINDS: dict[str, Kind] = {".png": "picture", ".csv": "table", ".md": "report", ".html": "page"}
 _TABLES = {"metrics.json", "build.json", "run.json"}
 
 
@@ -59,7 +64,7 @@ class Gallery:
 
     def __init__(self, root: Path) -> None:
         self.root = root.resolve()
-        self._items: dict[str, Item] = {}
+        self._items: dict[str, Item] = {}  # by their identifiers
 
     def items(self) -> list[Item]:
         """Look what there is, the newest folders first."""
@@ -67,8 +72,11 @@ class Gallery:
         self._items = {item.id: item for item in found}
         return found
 
-    def content(self, id_: str) -> dict[str, Any] | bytes:
-        """Read an item: a PNG's bytes, the plain form of stacks, or rows of a table.
+    def content(self, id_: str) -> tuple[Kind, bytes]:
+        """Read an item.
+
+        Returns:
+            Its kind; and the bytes of a PNG, HTML for a report or a page, or JSON of stacks or of a table's rows.
 
         Raises:
             StackgenError: If there is no such item, or it cannot be read.
@@ -80,16 +88,27 @@ class Gallery:
         try:
             if path.stat().st_size > _MOST_BYTES:
                 raise StackgenError(f"{item.path} is larger than {_MOST_BYTES // 1_000_000} MB; it is not shown")
-            if item.kind == "picture":
-                return path.read_bytes()
-            if item.kind == "stacks":
-                content = read_stacks(path)
-                return {"file": to_json(content), "shapes": shape_meshes(content.world.catalogue)}
-            return {"rows": _rows(path)}
+            return item.kind, self._read(item, path)
         except StackgenError as error:
             raise StackgenError(str(error).replace(str(path), str(item.path))) from None
         except OSError as error:
             raise StackgenError(f"{item.path} cannot be read: {error.strerror or error}") from None
+
+    def _read(self, item: Item, path: Path) -> bytes:
+        if item.kind in ("picture", "page"):
+            return path.read_bytes()
+        if item.kind == "report":
+            return markdown_page(read_text(path), str(item.path), partial(self._address, item.path)).encode()
+        if item.kind == "table":
+            return json.dumps({"rows": _rows(path)}).encode()
+        content = read_stacks(path)
+        return json.dumps({"file": to_json(content), "shapes": shape_meshes(content.world.catalogue)}).encode()
+
+    def _address(self, of: Path, name: str) -> str | None:
+        """Give the address of what a report names; None for what is not in the gallery."""
+        named = os.path.normpath(of.parent / unquote(name.partition("#")[0]))
+        found = [item.id for item in self._items.values() if str(item.path) == named]
+        return f"/api/gallery/{found[0]}" if found else None
 
     def _walk(self) -> Iterator[Item]:
         """Walk folder by folder, breadth first; symbolic links are not followed."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Iterable
-from typing import Any
+from ipaddress import ip_address
 from urllib.parse import urlsplit
 
 from starlette.responses import Response
@@ -18,15 +18,26 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 MOST_BYTES = 9_000_000
 """Largest body of a request."""
 
+_NOTHING = "default-src 'none'; frame-ancestors 'none'; base-uri 'none'; form-action 'none'; "
+
 _HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self';"
-    " img-src 'self' data: blob:; frame-ancestors 'none'; base-uri 'none'; form-action 'none'",
-    "Cross-Origin-Opener-Policy": "same-origin",
-    "Cross-Origin-Resource-Policy": "same-origin",
-    "Referrer-Policy": "no-referrer",
-    "X-Content-Type-Options": "nosniff",
-    "Cache-Control": "no-cache",
+    b"content-security-policy": f"{_NOTHING}script-src 'self'; style-src 'self'; connect-src 'self';"
+    " img-src 'self' data: blob:".encode(),
+    b"cross-origin-opener-policy": b"same-origin",
+    b"cross-origin-resource-policy": b"same-origin",
+    b"referrer-policy": b"no-referrer",
+    b"x-content-type-options": b"nosniff",
+    b"cache-control": b"no-cache",
 }
+"""Headers of an answer that has not its own."""
+
+OF_A_REPORT = f"{_NOTHING}style-src 'self'; img-src 'self' data:"
+"""What a report of the gallery may load: no script runs in it."""
+
+OF_A_PAGE = (
+    f"{_NOTHING}sandbox allow-scripts; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
+)
+"""What somebody's HTML may do: run by itself, as of another origin, which the studio does not let in."""
 
 
 def refusal(status: int, sentence: str) -> Response:
@@ -43,11 +54,13 @@ class Guard:
 
     Args:
         app: Application behind it.
-        hosts: Names by which the studio is reached, without ports.
+        hosts: Names by which the studio is reached, without ports; 0.0.0.0 or :: for any address of this machine,
+            which no other site can make its own name for.
     """
 
     def __init__(self, app: ASGIApp, hosts: Iterable[str]) -> None:
         self.app, self.hosts = app, frozenset(host.lower() for host in hosts)
+        self.any_address = not self.hosts.isdisjoint({"0.0.0.0", "::"})
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """See ASGI."""
@@ -70,7 +83,8 @@ class Guard:
 
     def _refusal(self, headers: dict[bytes, bytes]) -> Response | None:
         host = headers.get(b"host", b"").decode("latin-1")
-        if self._name(f"//{host}") not in self.hosts:
+        name = self._name(f"//{host}")
+        if name not in self.hosts and not (self.any_address and _is_address(name)):
             return refusal(421, "this address is not one of the studio's: open the one that it printed")
         origin = headers.get(b"origin")
         foreign = origin is not None and origin.decode("latin-1").partition("://")[2] != host
@@ -87,6 +101,15 @@ class Guard:
             return urlsplit(address).hostname
         except ValueError:
             return None
+
+
+def _is_address(name: str | None) -> bool:
+    """Tell whether a host is a number, not a name."""
+    try:
+        ip_address(name or "")
+    except ValueError:
+        return False
+    return True
 
 
 _TOO_LARGE = f"the request is too large: at most {MOST_BYTES // 1_000_000} MB are taken, so scale the picture down"
@@ -124,8 +147,8 @@ class _Body:
 def _with_headers(send: Send) -> Send:
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
-            own: list[Any] = [(name.lower().encode(), value.encode()) for name, value in _HEADERS.items()]
-            message = {**message, "headers": [*message.get("headers", []), *own]}
+            own = dict(message.get("headers", []))
+            message = {**message, "headers": [*own.items(), *((k, v) for k, v in _HEADERS.items() if k not in own)]}
         await send(message)
 
     return sending

@@ -5,7 +5,6 @@ Endpoints only check what they are sent and hand the work to other processes (:m
 
 from __future__ import annotations
 
-import json
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from starlette.exceptions import HTTPException
 from stackgen.errors import StackgenError, printable
 from stackgen.studio.answers import Form, WorkResponse
 from stackgen.studio.gallery import Gallery
-from stackgen.studio.guard import Guard, refusal
+from stackgen.studio.guard import OF_A_PAGE, OF_A_REPORT, Guard, refusal
 from stackgen.studio.reference import reference_page
 from stackgen.studio.requests import (
     ArmRequest,
@@ -45,6 +44,14 @@ _PAGE = {
     "studio.js": ("studio.js", "text/javascript"),
     "studio.css": ("studio.css", "text/css"),
 }
+
+
+_MEDIA: dict[str, tuple[str, str | None]] = {
+    "picture": ("image/png", None),
+    "report": ("text/html", OF_A_REPORT),
+    "page": ("text/html", OF_A_PAGE),
+}
+"""Media of the gallery's kinds that are not JSON, and what they may load."""
 
 
 class Refusal(BaseModel):
@@ -117,19 +124,18 @@ def _add_page(app: FastAPI) -> None:
 
 
 def _add_gallery(app: FastAPI, gallery: Gallery) -> None:
-    @app.get("/api/gallery", summary="List the results on this machine: stacks files, pictures and tables.")
+    @app.get("/api/gallery", summary="List the results on this machine: stacks files, pictures, tables and reports.")
     def listing() -> list[dict[str, str]]:
         return [item.to_json() for item in gallery.items()]
 
     @app.get("/api/gallery/{item}", summary="Read a result that was listed.", responses=_REFUSALS)
     def content(item: Annotated[str, Path(pattern="^[0-9a-f]{16}$")]) -> Response:
         try:
-            found = gallery.content(item)
+            kind, found = gallery.content(item)
         except StackgenError as error:
             return refusal(404, printable(error))
-        if isinstance(found, bytes):
-            return Response(found, media_type="image/png")
-        return Response(json.dumps(found), media_type="application/json")
+        media, policy = _MEDIA.get(kind, ("application/json", None))
+        return Response(found, media_type=media, headers={"Content-Security-Policy": policy} if policy else None)
 
 
 @dataclass(frozen=True)

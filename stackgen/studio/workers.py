@@ -9,12 +9,14 @@ import asyncio
 import json
 import multiprocessing
 import signal
+import tempfile
 import traceback
 from collections import OrderedDict, deque
 from collections.abc import AsyncGenerator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from multiprocessing.connection import Connection
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from pydantic import BaseModel
@@ -159,7 +161,8 @@ class _Process:
     def __init__(self, context: Any, threads: ThreadPoolExecutor) -> None:
         self._pipe, theirs = context.Pipe()
         self._threads = threads
-        self._process = context.Process(target=_serve, args=(theirs,), daemon=True)
+        self._files = TemporaryDirectory(prefix="stackgen-studio-", ignore_cleanup_errors=True)
+        self._process = context.Process(target=_serve, args=(theirs, self._files.name), daemon=True)
         self._process.start()
         theirs.close()
 
@@ -191,16 +194,18 @@ class _Process:
             return "broken", f"the process ended: {error!r}"
 
     def kill(self) -> None:
-        """End it, whatever it does."""
+        """End it, whatever it does, and remove the temporary files that it leaves."""
         self._process.kill()
+        self._files.cleanup()
 
 
-def _serve(pipe: Connection) -> None:
-    """Work until nobody asks any more."""
+def _serve(pipe: Connection, files: str) -> None:
+    """Work until nobody asks any more; temporary files go into a folder that is removed afterwards."""
     import torch
 
     from stackgen.studio.work.tasks import TASKS, warm_up
 
+    tempfile.tempdir = files
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the server, which ends this
     torch.set_num_threads(1)
     warm_up()

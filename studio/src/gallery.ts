@@ -1,4 +1,4 @@
-// The results on this machine: pictures, tables, and stacks that can be opened.
+// The results on this machine: pictures, tables, reports, and stacks that can be opened.
 
 import { get, post, told } from "./api";
 import { button, byId, el } from "./dom";
@@ -6,12 +6,13 @@ import type { Shape, StackFacts, StacksFile } from "./types";
 
 interface Item {
   id: string;
-  kind: "stacks" | "picture" | "table";
+  kind: "stacks" | "picture" | "table" | "report" | "page";
   name: string;
   folder: string;
 }
 
 const MOST_OPENED = 12;
+const FACES = { stacks: "▦", table: "☰", report: "¶", page: "◧", picture: "" };
 
 export class Gallery {
   private readonly list = byId("gallery");
@@ -40,8 +41,9 @@ export class Gallery {
 
   private card(item: Item): HTMLElement {
     const address = `/api/gallery/${item.id}`;
-    const face = item.kind === "picture" ? el("img", { src: address, alt: "", loading: "lazy" }) : el("span", { class: "face" }, item.kind === "stacks" ? "▦" : "☰");
-    const card = button("", () => void this.look(item, address), { class: "card" });
+    const face = item.kind === "picture" ? el("img", { src: address, alt: "", loading: "lazy" }) : el("span", { class: "face", "aria-hidden": "true" }, FACES[item.kind]);
+    const document = item.kind === "report" || item.kind === "page"; // opens in a tab of its own
+    const card = document ? el("a", { class: "card", href: address, target: "_blank" }) : button("", () => void this.look(item, address), { class: "card" });
     card.append(face, el("span", {}, item.name));
     return card;
   }

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import tempfile
 import time
 from collections.abc import AsyncIterator, Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -142,7 +144,11 @@ def test_nobody_waits_for_a_process_that_cannot_begin(run: Callable[[Callable[[W
 
 
 @pytest.mark.slow
-def test_real_processes_work_refuse_and_are_gone_at_once() -> None:
+def test_real_processes_work_refuse_and_are_gone_at_once_with_their_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
     async def main() -> None:
         pool = Workers(1)
         pool.open()
@@ -158,3 +164,4 @@ def test_real_processes_work_refuse_and_are_gone_at_once() -> None:
         pool.close()
 
     asyncio.run(main())
+    assert not list(tmp_path.glob("stackgen-studio-*"))

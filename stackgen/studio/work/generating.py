@@ -62,7 +62,7 @@ def generate(request: GenerateRequest, send: Send) -> None:
             "file": to_json(found),
             "command": command_line(wish, reading, mask),
             "picture": base64.b64encode(png(picture)).decode("ascii"),
-            "notes": list(reading.notes) + _scaled(found, mask),
+            "notes": [*reading.notes, *_scaled(found, mask), *_fewer(found, wish)],
         }
     )
     for number, entry in enumerate(found.entries):
@@ -159,6 +159,14 @@ def _scaled(found: StacksFile, mask: Mask) -> list[str]:
     if abs(high - drawn) < 0.75:
         return []
     return [f"The drawing is {drawn} cells high; this method knows one scale, so it was made {high:.0f} cells high."]
+
+
+def _fewer(found: StacksFile, wish: Wish) -> list[str]:
+    """Say why there are fewer structures than were asked for, where there are."""
+    number = len(found.entries)
+    if number == wish.number:
+        return []
+    return [f"Only {number} of {wish.number} structures: no other layout was found that stands and fits."]
 
 
 def _read(text: str) -> Reading:
