@@ -99,6 +99,7 @@ def test_nobody_loads_what_only_others_need(code: str) -> None:
 def test_every_package_that_is_imported_is_declared_and_the_other_way_round() -> None:
     distribution = {
         "cv2": "opencv-python-headless",
+        "markdown_it": "markdown-it-py",
         "PIL": "pillow",
         "yaml": "pyyaml",
         "lazy_loader": "lazy-loader",
