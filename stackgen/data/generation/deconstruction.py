@@ -64,12 +64,15 @@ class Settler:
 
     def settle(self, stack: Stack) -> Settled | None:
         """Settle a design; None if it is not accepted. Designs are not at rest, so even a sure one is simulated."""
-        outcome = self._known(stack).outcome
+        outcome = self.at_rest(stack).outcome
         sure = outcome == "stands" or not (self.margins.enabled and self.margins.sure_designs)
         return self._simulated(stack) if sure and outcome != "falls" else None
 
     def settle_rest(self, rest: Settled) -> Settled | None:
-        """Settle the rest of a settled stack; None if it falls. A rest that surely stands is at rest already."""
+        """Settle what is left of a settled stack, or touches as if it had settled; None if it falls.
+
+        What surely stands is at rest already.
+        """
         match rest.outcome:
             case "stands":
                 return rest
@@ -84,7 +87,7 @@ class Settler:
             if not accept(rollout, self.limits):
                 return None
             stack = rollout.end
-            settled = self._known(stack)
+            settled = self.at_rest(stack)
             if settled.statics is None or settled.statics.silent:
                 continue
             if not settled.statics.holds(0.0):
@@ -93,7 +96,8 @@ class Settler:
                 break
         return settled
 
-    def _known(self, stack: Stack) -> Settled:
+    def at_rest(self, stack: Stack) -> Settled:
+        """Take a stack for one at rest, and ask statics what it knows of it."""
         friction, margins = self.simulator.physics.friction, self.margins
         statics = PlaneStatics(stack, friction, margins) if margins.enabled else None
         return Settled(stack, np.arange(len(stack)), statics)

@@ -20,7 +20,7 @@ import numpy as np
 from stackgen.data.card import write_card
 from stackgen.data.generation.executors import Executor, make_executor
 from stackgen.data.generation.recipes import samples_of, testset_contents
-from stackgen.data.generation.settings import REVISION, GenerateSettings
+from stackgen.data.generation.settings import REVISIONS, GenerateSettings
 from stackgen.data.generation.workshop import PARTS, MadeShard, Workshop, claim, disk_may_be_full, finished, sweep
 from stackgen.data.manifest import Manifest, ShardEntry, shard_entry
 from stackgen.data.shards import encode_shard, read_shard
@@ -188,7 +188,8 @@ def _are(settings: GenerateSettings, plain: Any) -> bool:
     """Tell whether a plain manifest without shards has these settings, where defaults stand for what it lacks."""
     try:
         manifest = Manifest.from_json(plain)
-        same = manifest.settings.get("revision", REVISION) == REVISION
+        revision = REVISIONS[settings.recipe]
+        same = manifest.settings.get("revision", revision) == revision
         return same and manifest.physics == settings.physics.to_json() and settings.from_manifest(manifest) == settings
     except StackgenError:
         return False

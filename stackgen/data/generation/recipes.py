@@ -77,7 +77,7 @@ def drawing_samples(
     good = [answer for answer in found if answer.margin >= how.margin]
     settler, samples = _settler(settings, simulator), []
     for place in rng.permutation(len(good)).tolist():
-        settled = settler.settle(good[place].stack)
+        settled = settler.settle_rest(settler.at_rest(good[place].stack))
         if settled is None:
             continue
         poses = settled.stack.poses.astype(np.float32)

@@ -13,7 +13,7 @@ from stackgen.data.card import write_card
 from stackgen.data.dataset import read_manifest
 from stackgen.data.generation.executors import Executor, make_executor
 from stackgen.data.generation.generate import ShardTask, draw, make_shards
-from stackgen.data.generation.settings import REVISION, GenerateSettings
+from stackgen.data.generation.settings import REVISIONS, GenerateSettings
 from stackgen.data.generation.workshop import PARTS, MadeShard, Workshop, disk_may_be_full
 from stackgen.data.manifest import Manifest, ShardEntry, shard_entry, shard_number
 from stackgen.data.shards import encode_shard, is_whole, iterate_shard
@@ -109,8 +109,8 @@ def _difference(manifest: Manifest) -> str:
     engine, revision = manifest.physics.get("engine"), manifest.settings.get("revision", 1)
     if engine != (here := _engine(manifest)):
         return f"it was made with {engine}, here is {here}"
-    if revision != REVISION:
-        return f"it was made by revision {revision} of the generator, here is {REVISION}"
+    if revision != (now := REVISIONS[GenerateSettings.from_manifest(manifest).recipe]):
+        return f"it was made by revision {revision} of the generator, here is {now}"
     return _SAME
 
 
@@ -144,10 +144,11 @@ def _cut(shard: MadeShard, samples: int) -> MadeShard:
 
 def _record(folder: Path, manifest: Manifest, others: list[MadeShard]) -> None:
     """Put what the new shards are into manifest and card."""
+    revision = REVISIONS[GenerateSettings.from_manifest(manifest).recipe]
     new: dict[str, dict[str, Any]] = {
         shard.name: {
             **shard_entry(shard.name, shard.content, shard.samples),
-            "made_with": f"{_engine(manifest)}, generator revision {REVISION}",
+            "made_with": f"{_engine(manifest)}, generator revision {revision}",
         }
         for shard in others
     }

@@ -18,8 +18,8 @@ from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, PAPER_GRID, Catalogue, G
 
 Recipe = Literal["deconstruction", "drawings"]
 
-REVISION = 1
-"""Revision of the generator: raised when equal settings begin to mean other stacks, so that the two are not mixed."""
+REVISIONS: dict[Recipe, int] = {"deconstruction": 1, "drawings": 2}
+"""Revision of each recipe: raised when equal settings begin to mean other stacks, so that the two are not mixed."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ class GenerateSettings:
             del plain["recipe"], plain["drawings"]
         else:
             plain["silhouette"] = "drawing"
-        return {"revision": REVISION, **json.loads(json.dumps(plain))}
+        return {"revision": REVISIONS[self.recipe], **json.loads(json.dumps(plain))}
 
     @staticmethod
     def from_manifest(manifest: Manifest) -> GenerateSettings:
