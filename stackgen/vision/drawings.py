@@ -182,7 +182,7 @@ def _background(levels: Levels) -> tuple[NDArray[np.float32], tuple[str, ...]]:
     other = around[np.abs(around - background).max(axis=1) > 3 * _CONTRAST]
     if levels.shape[2] == 3 and len(other) > 0.02 * len(around):
         tone = np.median(other, axis=0)
-        if tone.min() > 165 and background.mean() < 128 and (np.abs(other - tone).max(axis=1) < _CONTRAST).mean() > 0.6:
+        if tone.min() > 165 and background.mean() < 150 and (np.abs(other - tone).max(axis=1) < _CONTRAST).mean() > 0.6:
             background = tone
             notes = ("The picture is cut off along its edges; what is dark in it was taken for the structure.",)
     return background.astype(np.float32), notes

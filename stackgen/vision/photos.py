@@ -9,7 +9,6 @@ Legend: h x w pixels of the photo, H x W of the sheet seen straight on.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -20,7 +19,8 @@ from stackgen.errors import StackgenError
 from stackgen.vision.images import Picture
 from stackgen.vision.ink.rules import strong, without_rules
 from stackgen.vision.masks import components, extent, largest
-from stackgen.vision.sheets import FOCAL, Sheet, least_channel, straightened
+from stackgen.vision.sheets import Sheet, least_channel
+from stackgen.vision.straight import straightened
 from stackgen.world import Mask
 
 Floats = NDArray[np.float64]
@@ -33,12 +33,6 @@ FAINTEST = 0.1
 
 BESIDE = 0.045
 """Strokes are narrower than this, by the sheet's longer edge."""
-
-_HELD = np.radians([25.0, 8.0, 12.0])
-"""How far a camera is usually turned about its axes to the right, down and ahead, before a sheet [rad]."""
-
-_STRAY = np.radians(2.0)
-"""How far a hand turns a side that is as long as the drawing [rad]."""
 
 _DARKER_THAN_SHADOW = 0.33  # share of the light of the paper beside it
 
@@ -226,63 +220,3 @@ def _clear_edge(ink: Mask, corners: Floats, turn: Floats) -> None:
     cv2.fillPoly(inside, [np.round(there).astype(np.int32)], 1)
     cv2.polylines(inside, [np.round(there).astype(np.int32)], True, 0, 2 * margin + 1)
     ink &= inside > 0
-
-
-def straight_up(mask: Mask) -> Mask:
-    """Turn a drawing (H, W) until its sides are level and upright, as those of blocks are.
-
-    It stands for the sheet where no edges of one are seen: the drawing's own sides tell how the camera was held, which
-    is looked for by least squares among usual ways to hold it.
-    """
-    contours, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-    size = max(max(cv2.boundingRect(contour)[2:]) for contour in contours)
-    sides = _sides(contours, size)
-    middle, focal = np.array(mask.shape[::-1]) / 2, FOCAL * max(mask.shape)
-    lengths = np.linalg.norm(sides[:, 1] - sides[:, 0], axis=1)
-    upright = np.abs(_angles(sides)) > np.pi / 4
-    weights = np.sqrt(lengths / size) / _STRAY
-
-    def off(turns: Floats) -> Floats:
-        """How far sides are from level or upright, and how unusual the turns of the camera [rad] are."""
-        angles = _angles(_seen_turned(sides, turns, middle, focal))
-        wrong = np.where(upright, np.abs(angles) - np.pi / 2, angles)
-        return np.concatenate([weights * wrong, turns / _HELD])
-
-    from scipy.optimize import least_squares  # here: importing it costs most pictures more than reading them
-
-    turns = np.asarray(least_squares(off, np.zeros(3), loss="soft_l1").x)
-    around = np.concatenate(contours)[:, 0].astype(np.float64)
-    there = _seen_turned(around, turns, middle, focal)
-    low, high = there.min(axis=0), there.max(axis=0)
-    scale, edge = 0.8 * max(mask.shape) / max(float((high - low).max()), 1.0), 0.1 * max(mask.shape)
-    corners = np.array([[0, 0], [mask.shape[1], 0], mask.shape[::-1], [0, mask.shape[0]]], np.float64)
-    goal = (_seen_turned(corners, turns, middle, focal) - low) * scale + edge
-    turn = cv2.getPerspectiveTransform(corners.astype(np.float32), goal.astype(np.float32))
-    width, height = np.round((high - low) * scale + 2 * edge).astype(int)
-    turned = np.asarray(cv2.warpPerspective(mask.astype(np.float32), turn, (int(width), int(height)))) >= 0.5
-    return turned if turned.any() else mask
-
-
-def _sides(contours: Sequence[cv2.typing.MatLike], size: int) -> Floats:
-    """Return the ends (n, 2, 2) of the long straight sides that are nearly level or upright."""
-    found = []
-    for contour in contours:
-        points = cv2.approxPolyDP(contour, 0.02 * size, True)[:, 0].astype(np.float64)
-        found.append(np.stack([points, np.roll(points, -1, axis=0)], axis=1))
-    sides = np.concatenate(found)
-    angles = np.abs(_angles(sides))
-    near = np.minimum(angles, np.pi / 2 - angles) < np.radians(25)
-    return np.asarray(sides[near & (np.linalg.norm(sides[:, 1] - sides[:, 0], axis=1) > 0.12 * size)])
-
-
-def _angles(sides: Floats) -> Floats:
-    """Return the angles (n,) of sides (n, 2, 2) above the horizontal, whichever way they go [-pi / 2..pi / 2]."""
-    x, y = (sides[:, 1] - sides[:, 0]).T
-    return np.asarray(np.arctan(y / np.where(x == 0, 1e-9, x)))
-
-
-def _seen_turned(points: Floats, turns: Floats, middle: Floats, focal: float) -> Floats:
-    """Return where points (..., 2) [pixel] are seen when the camera is turned about its three axes [rad]."""
-    turn, _ = cv2.Rodrigues(turns)
-    rays = np.concatenate([(points - middle) / focal, np.ones((*points.shape[:-1], 1))], axis=-1) @ turn.T
-    return np.asarray(rays[..., :2] / np.maximum(rays[..., 2:], 0.05) * focal + middle)

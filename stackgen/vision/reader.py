@@ -25,8 +25,9 @@ from stackgen.vision.ink.choice import choose
 from stackgen.vision.ink.rules import without_rules
 from stackgen.vision.masks import bounding_box, filling, place
 from stackgen.vision.options import PictureKind, PictureOptions
-from stackgen.vision.photos import is_drawn_on, read_page, straight_up
+from stackgen.vision.photos import is_drawn_on, read_page
 from stackgen.vision.sheets import Sheet, find_sheet
+from stackgen.vision.straight import straight_up
 from stackgen.world import Grid, Mask
 
 if TYPE_CHECKING:

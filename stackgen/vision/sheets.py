@@ -25,14 +25,6 @@ Ints = NDArray[np.int64]
 FOCAL = 0.75
 """Focal length of a usual camera by the photo's longer edge: a telephone's, a webcam's or a RealSense's is near it."""
 
-FOCALS = (0.6, 1.6)
-"""Least and largest focal length that is believed, by the photo's longer edge."""
-
-SHEETS = (0.707, 0.773)
-"""Proportions of sheets of A4 and of Letter."""
-
-_BETWEEN = 0.755  # nearer to Letter, as most sheets are of A4
-
 LEAST_SHEET = 0.05
 """A sheet is at least this share of the photo."""
 
@@ -42,13 +34,15 @@ SUPPORT = 0.6
 _SEARCH = 400  # longer edge at which the sheet is looked for; all lengths below are pixels of this
 
 _TRIED = 40  # edges along which light is looked at
-_MOST_LINES = 14  # those of them that may be sides, beside the photo's own
+_MOST_LINES = 8  # those of them, level and upright ones each, that may be sides, beside the photo's own
 _REACH = 500  # how far a line is followed to either side
 _BESIDE = 5  # how far from a side inside and outside are compared
 _BEYOND = 14  # so far from it, to one side, a mere line is as it is on the other
 _LEAST_SEEN = 15  # a side of which less is seen tells nothing
 _AT_EDGE = 4.0  # what is nearer to the photo's edge is cut off by it
 _LEVEL = 0.95  # light beyond a dark line by that before it
+
+_LARGE = 0.45  # exponent of its area: what a shadow divides off is smaller
 
 _UNSEEN = 0.8  # what each side costs that is not seen
 
@@ -142,8 +136,10 @@ def _frame(shape: tuple[int, ...]) -> Floats:
 def _best_quadrangle(small: Picture, lines: Floats) -> tuple[Floats, float] | None:
     """Return the corners of the quadrangle of lines (N, 2, 2) most like a sheet, and how clear its sides are."""
     steps, depths, known = _steps(small, lines)
-    clearest = np.argsort(-depths[:, :-4, -1].max(axis=0))[:_MOST_LINES]
-    chosen = np.append(clearest, len(lines) + np.arange(-4, 0))
+    clearest = np.argsort(-(depths - steps / 3)[:, :-4, -1].max(axis=0))  # depth counts more than length
+    upright = np.abs(_normals(lines)[clearest]).argmax(axis=1) == 0
+    of_both = [clearest[upright == turned][:_MOST_LINES] for turned in (False, True)]  # stripes of a table are many
+    chosen = np.concatenate([*of_both, len(lines) + np.arange(-4, 0)])
     lines, steps, depths, known = lines[chosen], steps[:, chosen], depths[:, chosen], known[chosen]
     sides, corners, ends = _quadrangles(lines, small.shape)
     if not len(sides):
@@ -165,7 +161,7 @@ def _best_quadrangle(small: Picture, lines: Floats) -> tuple[Floats, float] | No
 
     sureness, depth = least(steps), least(depths)
     areas = np.abs(_cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)) / 2 / (small.shape[0] * small.shape[1])
-    score = sureness * depth**0.5 * np.minimum(areas, 1) ** 0.35 * _UNSEEN ** np.count_nonzero(~seen, axis=1)
+    score = sureness * depth**0.5 * np.minimum(areas, 1) ** _LARGE * _UNSEEN ** np.count_nonzero(~seen, axis=1)
     enough = (np.count_nonzero(seen, axis=1) > 2) | ((np.count_nonzero(seen, axis=1) == 2) & (areas > 0.5))
     score[(sureness < SUPPORT) | ~enough | _is_frame(corners, small.shape)] = 0
     best = int(score.argmax())
@@ -345,54 +341,3 @@ def _clockwise(corners: Floats) -> Floats:
     angles = np.arctan2(*(corners - middle).T[::-1])
     corners = corners[np.argsort(angles)]  # y points down: growing angles run clockwise
     return np.roll(corners, -int(corners.sum(axis=1).argmin()), axis=0)
-
-
-def _usual(ratio: float) -> float:
-    """Return the proportions of the sheets that people have where they are near: those of A4 and of Letter."""
-    short = min(ratio, 1 / ratio)
-    near = SHEETS[0] if short < _BETWEEN else SHEETS[1]
-    if abs(near - short) > 0.1 * near:
-        return ratio
-    return near if ratio < 1 else 1 / near
-
-
-def straightened(photo: Picture, sheet: Sheet, size: int) -> tuple[Picture, Floats]:
-    """Show the sheet straight on.
-
-    Returns:
-        (h', w', 3) the sheet, `size` pixels for its longer edge, and the (3, 3) homography from photo to sheet.
-    """
-    corners = sheet.corners
-    ratio = sheet_ratio(corners - np.array(photo.shape[1::-1]) / 2, max(photo.shape))
-    ratio = _usual(ratio) if sheet.seen == 4 else ratio
-    width, height = (size, round(size / ratio)) if ratio > 1 else (round(size * ratio), size)
-    there = np.array([[0, 0], [width, 0], [width, height], [0, height]], dtype=np.float32)
-    turn = cv2.getPerspectiveTransform(corners.astype(np.float32), there)
-    straight = cv2.warpPerspective(photo, turn, (width, height), borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(straight, dtype=np.uint8), np.asarray(turn)
-
-
-def sheet_ratio(corners: Floats, edge: float) -> float:
-    """Estimate width by height of a rectangle from its picture.
-
-    Two pairs of parallel edges tell the focal length, and with it the proportions (Zhang and He, "Whiteboard scanning
-    and image enhancement", 2007, section 3). A sheet seen nearly straight on tells it badly, so it is kept to what
-    cameras have; there it matters little.
-
-    Args:
-        corners: (4, 2) clockwise from the upper left, relative to the middle of the photo [pixel].
-        edge: Longer edge of the photo [pixel].
-
-    >>> round(sheet_ratio(np.array([[-2.0, -1], [2, -1], [2, 1], [-2, 1]]), 5.0), 6)
-    2.0
-    """
-    one, two, four, three = (np.append(corner / edge, 1.0) for corner in corners)  # four is opposite of one
-    k2 = np.cross(one, four) @ three / (np.cross(two, four) @ three)
-    k3 = np.cross(one, four) @ two / (np.cross(three, four) @ two)
-    across, down = k2 * two - one, k3 * three - one
-    product = across[2] * down[2]
-    square = -(across[:2] @ down[:2]) / product if abs(product) > 1e-4 else 0.0
-    seen = np.clip(np.sqrt(square), *FOCALS) if square > 0 else FOCAL
-    focal = np.sqrt(seen * FOCAL)  # corners tell it badly, and most cameras are alike
-    lengths = [np.hypot(np.linalg.norm(vector[:2]) / focal, vector[2]) for vector in (across, down)]
-    return float(np.clip(lengths[0] / lengths[1], 0.3, 3.3))

@@ -117,3 +117,23 @@ def test_of_two_drawings_one_is_asked_for() -> None:
     with pytest.raises(StackgenError, match=r"which must lie in 1\.\.2"):
         choose(ink, which=3)
     assert iou(choose(ink, spread=True).mask, solid(left, right)) > 0.95  # both stand on the ground
+
+
+def test_a_block_between_others_whose_outline_has_gaps_is_not_lost() -> None:
+    tower = [box(200, 100 + 100 * row, 400, 200 + 100 * row) for row in range(3)]
+    ink = drawn(*tower)
+    ink[230:237, 190:210] = ink[250:256, 390:410] = False
+    assert iou(choose(ink).mask, solid(*tower)) > 0.95
+
+
+def test_the_sides_of_a_block_tell_that_the_ground_line_is_its_base() -> None:
+    base, top = box(250, 300, 350, 400), box(100, 200, 400, 300)
+    ink = drawn(top) | drawn(np.array([[250, 400], [250, 300], [350, 300], [350, 400]]), closed=False)
+    ink[399:405, 20:560] = True
+    found = choose(ink)
+    assert iou(found.mask, solid(base, top)) > 0.95 and "ground line" in " ".join(found.notes)
+
+
+def test_a_drawing_that_runs_off_is_not_replaced_by_less_without_a_word() -> None:
+    ink = drawn(np.array([[0, 100], [300, 100], [300, 400], [0, 400]]), box(420, 100, 500, 180))
+    assert "uncertain" in " ".join(choose(ink).notes)

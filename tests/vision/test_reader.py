@@ -42,6 +42,9 @@ PAPERS: dict[str, dict[str, Any]] = {
     "pencil": {"ink": (130, 130, 135), "width": 4, "style": "outline"},
     "crayon": {"ink": (225, 110, 30), "crayon": 0.2, "width": 12, "style": "outline"},
     "hatched": {"style": "hatched", "ink": (190, 40, 40), "shadow": 0.4},
+    "filled, half in a shadow": {"filled": True, "tone": (222, 215, 200), "shadow": 0.5, "softness": 3},
+    "hatched, half in a shadow": {"style": "hatched", "ink": (110, 110, 115), "paper": "squared", "shadow": 0.6},
+    "light table": {"style": "outline", "table": (165, 160, 150), "zoom": 0.8, "shadow": 0.5, "paper": "ruled"},
     "beside": {"style": "outline", "beside": True},
     "runs off": {"zoom": 1.15, "style": "outline"},
 }

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from stackgen.vision.photos import straight_up
-from stackgen.vision.sheets import find_sheet, sheet_ratio
+from stackgen.vision.sheets import find_sheet
+from stackgen.vision.straight import sheet_ratio, straight_up
 
 CORNERS = np.array([[150, 90], [640, 120], [700, 500], [90, 470]])
 

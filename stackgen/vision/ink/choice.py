@@ -66,11 +66,12 @@ def _chosen(ink: Mask, edge: Mask, which: int | None, spread: bool, framed: bool
     """Find the drawing in ink (H, W), as `choose` does, where what lies in `edge` (H, W) runs off."""
     groups = near_parts(ink, TOGETHER)
     found = [_one(group) for group in groups]
-    seen = list(zip(groups, found, strict=True))
+    seen, cut = list(zip(groups, found, strict=True)), []
     if framed:
         inner = [pair for pair in seen if not _at_edge(*pair, edge)]
-        seen = inner if not spread or _most(inner) > RIVAL * _most(seen) else seen
-    drawings = _that_can_be_read(seen, cut=len(seen) < len(found))
+        if not spread or _most(inner) > RIVAL * _most(seen):
+            seen, cut = inner, [group for group, part in seen if _at_edge(group, part, edge)]
+    drawings = _that_can_be_read(seen, cut=bool(cut))
     if not spread:
         # A name is drawn near the structure, too: what is not right beside its largest part is left out.
         drawings = [
@@ -94,6 +95,8 @@ def _chosen(ink: Mask, edge: Mask, which: int | None, spread: bool, framed: bool
         )
     left_out = len(found) - 1 - len(beside)
     notes = main.notes + (("What is drawn beside the structure was left out.",) if left_out else ())
+    if any(_width(group) > _width(main.mask) for group in cut):
+        notes = (*notes, "Something larger runs off, so which drawing counts is uncertain.")
     mask = np.any([part.mask for part in (main, *beside)], axis=0)
     return Filled(mask, main.stroke, notes, main.sureness * (0.95 if left_out else 1.0))
 
