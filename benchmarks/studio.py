@@ -1,7 +1,9 @@
 """How quick the studio answers, and whether any request of its schema makes it stumble.
 
 A studio is started as a user starts it. Times are those of a client on this machine: of the page's three files, of the
-first message of noise, and of three verified stacks. The fuzzer makes requests by the OpenAPI schema that the studio
+first message of noise, and of three verified stacks. In Chromium, where there is one, the frames are counted that the
+page draws while the arm builds ten blocks, and its own work for each is timed: on slow graphics that is what the page
+can answer for. The fuzzer makes requests by the OpenAPI schema that the studio
 publishes, most of them with something wrong in it, and counts the statuses.
 """
 
@@ -12,6 +14,7 @@ import copy
 import json
 import random
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -19,6 +22,9 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from http.client import HTTPConnection, HTTPResponse
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -38,6 +44,23 @@ LEANING = {
     ],
 }
 """A stack that falls, so that no arm builds it."""
+
+TEN = [{"shape": "cube", "position": [i - (row - 1) / 2, 0, 4.5 - row]} for row in (4, 3, 2, 1) for i in range(row)]
+"""Blocks of a pyramid, which the arm builds."""
+
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+GRAPHICS = ("--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+WATCHED = 10.0  # [s]
+
+_WATCH = """
+window.work = [];
+const ask = window.requestAnimationFrame.bind(window);
+window.requestAnimationFrame = (frame) => ask((now) => {
+  const began = performance.now();
+  frame(now);
+  window.work.push(performance.now() - began);
+});
+"""
 
 VALID = 0.03
 """Share of the requests in which nothing is wrong."""
@@ -63,11 +86,15 @@ def main() -> None:
     chosen = parser().parse_args()
     with studio() as address:
         times = {name: summary([one(address) for _ in range(chosen.runs)]) for name, one in TIMED.items()}
+        frames = drawn(address) if CHROMIUM and find_spec("playwright") else None
         statuses = fuzzed(address, chosen.requests, random.Random(chosen.seed))
         alive = ask(address, "GET", "/api/start")[0] == 200
-    metrics = {"seconds": times, "requests": chosen.requests, "statuses": statuses, "alive": alive}
+    metrics = {"seconds": times, "frames": frames, "requests": chosen.requests, "statuses": statuses, "alive": alive}
     rows = [[name, f"{t['median']:.3f}", f"{t['min']:.3f}", f"{t['max']:.3f}"] for name, t in times.items()]
     tables = [plain_table("seconds", ("what", "median", "least", "most"), rows)]
+    if frames:
+        shown = [[name, f"{value:.1f}"] for name, value in frames.items()]
+        tables += [plain_table("the page draws the arm and ten blocks", ("what", "value"), shown)]
     tables += [plain_table("fuzzer", ("status", "answers"), [[s, str(n)] for s, n in statuses.items()])]
     report("studio", metrics, tables, chosen.out)
 
@@ -75,7 +102,17 @@ def main() -> None:
 @contextmanager
 def studio() -> Iterator[str]:
     """Run a studio, and yield host and port once it is warm."""
-    command = [sys.executable, "-m", "stackgen", "studio", "--port", "0", "--gallery", str(ROOT / "examples")]
+    command = [sys.executable, "-m", "stackgen", "studio", "--port", "0"]
+    with TemporaryDirectory() as gallery:
+        pyramid = {"format": "stackgen.stacks/1", "stacks": [{"blocks": TEN}]}
+        (Path(gallery) / "stacks.json").write_text(json.dumps(pyramid))
+        with serving([*command, "--gallery", gallery]) as address:
+            yield address
+
+
+@contextmanager
+def serving(command: list[str]) -> Iterator[str]:
+    """Run a command that serves a studio, and yield host and port once it is warm."""
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as server:
         assert server.stdout is not None
         found = re.search(r"http://\S+/", server.stdout.readline())
@@ -153,6 +190,33 @@ TIMED = {
     "first frame of the noise": first_frame,
 }
 """What is timed."""
+
+
+def drawn(address: str) -> dict[str, float]:
+    """Have the arm build ten blocks, and count the frames of the page meanwhile."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=list(GRAPHICS), timeout=600_000)
+        page = chromium.new_page(viewport={"width": 1280, "height": 800})
+        page.set_default_timeout(600_000)
+        page.add_init_script(_WATCH)
+        page.goto(f"http://{address}/")
+        page.get_by_role("button", name="Gallery").click()
+        page.get_by_role("button", name="stacks.json").click()
+        page.locator(".pane[data-done]").first.wait_for()
+        page.get_by_label("Speed").first.select_option("1")
+        page.get_by_role("button", name="Have the arm build it").first.click()
+        page.locator(".badge", has_text="building").first.wait_for()
+        page.evaluate("work.length = 0")
+        page.wait_for_timeout(1000 * WATCHED)
+        work = np.array(page.evaluate("work"))
+        chromium.close()
+    return {
+        "frames in a second": len(work) / WATCHED,
+        "work of the page for a frame, median [ms]": float(np.median(work)),
+        "work of the page for a frame, 95th percentile [ms]": float(np.quantile(work, 0.95)),
+    }
 
 
 def fuzzed(address: str, number: int, chance: random.Random) -> dict[str, int]:

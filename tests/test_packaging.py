@@ -30,6 +30,13 @@ def test_the_committed_page_of_the_studio_is_that_of_its_source(name: str) -> No
     assert (ROOT / "stackgen" / "assets" / "studio" / name).read_bytes() == (ROOT / "studio" / name).read_bytes()
 
 
+@pytest.mark.slow
+@pytest.mark.skipif(not (ROOT / "studio/node_modules").is_dir(), reason="needs Node: cd studio && npm ci")
+def test_the_committed_script_of_the_studio_is_what_its_source_becomes(tmp_path: Path) -> None:
+    subprocess.run(["node", "build.mjs", tmp_path], cwd=ROOT / "studio", check=True)
+    assert (tmp_path / "studio.js").read_bytes() == (ROOT / "stackgen/assets/studio/studio.js").read_bytes()
+
+
 def test_every_file_of_the_package_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     distribution = setuptools.Distribution({"script_name": "setup.py"})

@@ -14,6 +14,10 @@ from typing import Any
 
 import pytest
 
+from stackgen.io.stacks_file import read_stacks
+from stackgen.sim.checkers import SimulatorChecker
+from stackgen.viz.page import write_html
+
 playwright = pytest.importorskip("playwright.sync_api", reason="drives the browser: pip install playwright")
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -21,6 +25,12 @@ PATIENCE = 300_000  # [ms]
 SIZES = {"desktop": (1500, 950), "tablet": (1000, 1200), "phone": (390, 844)}
 OWN = ("data:", "blob:", "about:")
 GRAPHICS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # without a graphics card
+SHIFTS = """
+window.shifted = 0;
+new PerformanceObserver((list) => list.getEntries().forEach((entry) => (window.shifted += entry.value)))
+  .observe({ type: "layout-shift", buffered: true });
+"""
+AXE = Path("studio/node_modules/axe-core/axe.min.js")  # by `npm ci` in studio/
 
 pytestmark = [
     pytest.mark.slow,
@@ -33,6 +43,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A studio that runs, with one result to show."""
     results = tmp_path_factory.mktemp("results")
     shutil.copy("examples/stacks/cantilever.json", results / "stacks.json")
+    (results / "report.md").write_text("| a |\n| - |\n| 7 |\n")
     command = [sys.executable, "-m", "stackgen", "studio", "--port", "0", "--workers", "2", "--gallery", str(results)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:
@@ -43,22 +54,29 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         server.terminate()
 
 
-@pytest.fixture(params=SIZES)
-def page(request: pytest.FixtureRequest, address: str) -> Iterator[Any]:
-    """The page in a window of each size; it asks nobody else, and no error is heard."""
-    width, height = SIZES[request.param]
-    heard: list[str] = []
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    """One browser for all tests."""
     with playwright.sync_playwright() as driver:
-        arguments = ["--no-sandbox", *GRAPHICS]
-        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=arguments, timeout=PATIENCE)
-        page = chromium.new_page(viewport={"width": width, "height": height})
-        page.set_default_timeout(PATIENCE)
-        page.on("pageerror", lambda error: heard.append(str(error)))
-        page.on("request", lambda asked: heard.extend([asked.url] * (not asked.url.startswith((address, *OWN)))))
-        page.goto(address)
-        page.locator("#method").wait_for()
-        yield page
-        chromium.close()
+        yield driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *GRAPHICS], timeout=PATIENCE)
+
+
+@pytest.fixture
+def page(request: pytest.FixtureRequest, address: str, chromium: Any) -> Iterator[Any]:
+    """The page, in a window of its own; it asks nobody else, and no error is heard."""
+    width, height = SIZES[getattr(request, "param", "desktop")]
+    heard: list[str] = []
+    # With little motion, so that a machine without a graphics card has little to draw.
+    context = chromium.new_context(viewport={"width": width, "height": height}, reduced_motion="reduce")
+    context.add_init_script(SHIFTS)
+    page = context.new_page()
+    page.set_default_timeout(PATIENCE)
+    page.on("pageerror", lambda error: heard.append(str(error)))
+    page.on("request", lambda asked: heard.extend([asked.url] * (not asked.url.startswith((address, *OWN)))))
+    page.goto(address)
+    page.locator("#method").wait_for()
+    yield page
+    context.close()
     assert heard == []
 
 
@@ -93,6 +111,15 @@ def drawn(page: Any) -> str:
     return str(page.evaluate("localStorage.getItem('stackgen-studio')"))
 
 
+def generate(page: Any, compared: str = "") -> None:
+    page.select_option("#compared", compared)
+    page.get_by_label("Structures", exact=True).fill("1")
+    page.get_by_label("Structures", exact=True).blur()
+    page.get_by_role("button", name="Generate").click()
+    page.locator(".pane[data-done]").nth(1 if compared else 0).wait_for()
+
+
+@pytest.mark.parametrize("page", SIZES, indirect=True)
 def test_from_a_drawing_to_files_and_back(page: Any, address: str) -> None:
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
     draw_a_gate(page)
@@ -101,25 +128,27 @@ def test_from_a_drawing_to_files_and_back(page: Any, address: str) -> None:
     assert drawn(page) != kept
     page.get_by_role("button", name="Redo").click()
     assert drawn(page) == kept
-    page.select_option("#compared", "ddpm-verdicts")
-    page.get_by_role("button", name="Generate").click()
-    page.locator(".pane[data-done]").nth(1).wait_for()
+    generate(page, "ddpm-verdicts")
     assert page.locator(".pane >> visible=true").count() == 2
     assert page.locator(".overlays canvas").count() == 6
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    slide(page, "Tilt of the table in degrees", 44)
+    assert page.evaluate("shifted") < 0.1  # what the web calls good
+    page.get_by_role("button", name="Until it falls").first.click()
     page.locator(".answer.falls").first.wait_for()
+    assert "falls at" in page.locator(".badge.falls").first.text_content()
+    page.get_by_label("Show weights").first.check()
+    assert page.locator(".badge").first.text_content() == "stands"  # on a level table again
     content = json.loads(saved(page, "stacks.json").read_text())
     assert content["stacks"][0]["verdict"]["stable"]
     assert saved(page, "GLB").read_bytes().startswith(b"glTF")
     assert saved(page, "PNG").read_bytes().startswith(b"\x89PNG")
     assert saved(page, "silhouette.png").read_bytes().startswith(b"\x89PNG")
     assert b"ftyp" in saved(page, "MP4").read_bytes()[:16]
+    page.get_by_role("button", name="Copy a link").click()
+    link = page.url
     page.reload()
     page.locator("#method").wait_for()
     assert drawn(page).split(".")[:2] == kept.split(".")[:2]
-    page.get_by_role("button", name="Copy a link").click()
-    link = page.url
     page.evaluate("localStorage.clear()")
     page.goto("about:blank")
     page.goto(link)
@@ -146,18 +175,41 @@ def test_it_is_drawn_with_the_keyboard_alone(page: Any) -> None:
 
 def test_results_are_shown_and_opened(page: Any) -> None:
     page.get_by_role("button", name="Gallery").click()
+    with page.expect_popup() as shown:
+        page.get_by_role("link", name="report.md").click()
+    assert shown.value.locator("td").text_content() == "7"
     page.get_by_role("button", name="stacks.json").first.click()
     page.locator(".pane[data-done]").first.wait_for()
     assert page.locator(".tabs button").count() >= 1
 
 
-@pytest.mark.parametrize("page", ["desktop"], indirect=True)
 def test_the_arm_builds_what_was_drawn(page: Any) -> None:
     page.select_option("#presets", "Tower")
-    page.select_option("#compared", "")
-    page.get_by_role("button", name="Generate").click()
-    page.locator(".pane[data-done]").first.wait_for()
+    generate(page)
     page.get_by_label("Speed").first.select_option("12")
     page.get_by_role("button", name="Have the arm build it").first.click()
     page.locator("[data-built]").wait_for()
     assert "and it stands" in page.locator(".build .answer").first.text_content()
+
+
+@pytest.mark.skipif(not AXE.is_file(), reason="needs axe-core: cd studio && npm ci")
+@pytest.mark.parametrize("page", ["phone"], indirect=True)
+def test_nothing_keeps_a_screen_reader_out_in_light_and_dark(page: Any) -> None:
+    generate(page)
+    page.evaluate(AXE.read_text())
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme=scheme)
+        found = page.evaluate("axe.run(document, { resultTypes: ['violations'] })")["violations"]
+        assert [(one["id"], [node["html"] for node in one["nodes"]]) for one in found] == []
+
+
+def test_a_page_of_show_turns_and_settles_without_a_server(chromium: Any, tmp_path: Path) -> None:
+    content = read_stacks("examples/stacks/arch.json")
+    write_html(tmp_path / "a.html", content.stacks, SimulatorChecker().check_all(content.stacks), "An arch")
+    page = chromium.new_page()
+    page.set_default_timeout(PATIENCE)
+    page.goto((tmp_path / "a.html").as_uri())
+    page.get_by_role("button", name="Play").click()
+    assert page.locator(".badge").text_content() == "stands"
+    assert page.locator("h1").text_content() == "An arch"
+    page.close()

@@ -129,6 +129,7 @@ export class Building {
             stage.say("building", "busy");
             played = stage.playClip(clip, true);
           }
+          stage.player.grown(true);
         } else if (message.kind === "placed") {
           this.starts.push(clip.frames.length / clip.rate);
           this.status.textContent = `${message.blocks} of ${this.stack!.shapes.length} blocks are simulated`;
@@ -139,9 +140,10 @@ export class Building {
           for (const contact of message.unplanned) stands += ` Not planned: ${contact}.`;
         }
       }
-      stage.player.finish();
+      stage.player.grown(false);
       this.status.textContent = stands;
       await played;
+      if (running.signal.aborted) return;
       stage.say(last ? "built, and stands" : "does not stand", last ? "stands" : "falls");
       this.element.dataset.built = "";
     } catch (error) {

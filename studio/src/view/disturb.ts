@@ -52,7 +52,11 @@ export class Disturbances {
   private stack: StackFacts | null = null;
   private place = 0;
 
-  constructor(private readonly stage: Stage) {
+  /** @param begins Called before the stage is used. */
+  constructor(
+    private readonly stage: Stage,
+    private readonly begins: () => void,
+  ) {
     const towards = choice(DIRECTIONS, "0", (value) => {
       this.tiltDirection = value;
       if (Number(this.tilted.slider.value)) void this.tilt();
@@ -109,6 +113,7 @@ export class Disturbances {
   private preview(track: Track): void {
     const value = Number(track.slider.value);
     this.reset();
+    this.begins();
     track.show(value);
     this.stage.still();
     if (track === this.tilted) this.stage.world.tilt(value, Number(this.tiltDirection));
@@ -159,7 +164,7 @@ export class Disturbances {
         const [now, start] = [rollout.frames[Math.floor(time * rollout.rate + 1e-6)]![block]!, rollout.frames[0]![block]!];
         disturb(amount, now.slice(0, 3).map((x, i) => x - start[i]!));
         track.show(amount);
-        if (stage.player.playing || time < stage.player.duration) return;
+        if (!stage.player.atEnd) return;
         track.markFall(rollout.fell_at);
         this.answer.textContent = whole;
         this.answer.className = `answer ${rollout.stable ? "stands" : "falls"}`;

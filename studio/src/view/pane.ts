@@ -21,6 +21,7 @@ export class Pane {
   private readonly state = el("p", { class: "state", role: "status" });
   private readonly tabs = el("div", { class: "tabs", role: "group", "aria-label": "Structures" });
   private readonly facts = el("div", { class: "facts" });
+  private readonly share = el("div", { class: "share" });
   private readonly disturbances: Disturbances;
   private readonly building: Building;
   private readonly tools: HTMLElement;
@@ -38,7 +39,7 @@ export class Pane {
   ) {
     this.stage = new Stage(start.shapes, `Structure ${number}`);
     this.shapes = start.shapes;
-    this.disturbances = new Disturbances(this.stage);
+    this.disturbances = new Disturbances(this.stage, () => this.building.reset());
     this.building = new Building(this.stage, () => this.disturbances.reset());
     this.stage.world.onPick = (block) => this.disturbances.choose(block);
     const explosion = el("input", { type: "range", min: 0, max: 1.5, step: 0.01, value: 0, "aria-label": "Explode" });
@@ -60,6 +61,7 @@ export class Pane {
       this.tabs,
       this.facts,
       this.tools,
+      this.share,
     );
   }
 
@@ -85,7 +87,7 @@ export class Pane {
             this.element.dataset.firstFrame = String(Math.round(performance.now() - began));
             noise = this.stage.playClip({ frames, rate: NOISE_RATE }, true);
           }
-          if (message.step >= message.steps) this.stage.player.finish();
+          this.stage.player.grown(message.step < message.steps);
         } else if (message.kind === "checked") {
           [checked, standing] = [checked + 1, standing + Number(message.stable)];
           this.state.textContent = `${standing} of ${checked} simulated stand`;
@@ -136,6 +138,7 @@ export class Pane {
     this.building.reset();
     this.tabs.replaceChildren();
     this.facts.replaceChildren();
+    this.share.replaceChildren();
     delete this.element.dataset.done;
   }
 
@@ -171,8 +174,8 @@ export class Pane {
     this.facts.replaceChildren(
       ...this.file.notes.map((note) => el("p", { class: "note" }, note)),
       el("div", { class: "columns" }, why(stack, this.shapes), ...(stack.views ? [overlays(stack.views, size)] : [])),
-      downloads(this.file, number, this.stage.world),
     );
+    this.share.replaceChildren(downloads(this.file, number, this.stage.world));
     this.building.take(this.file.file, number, stack);
     this.disturbances.take(this.file.file, number, stack, this.shapes.map((shape) => shape.name));
     this.tools.hidden = false;
@@ -189,7 +192,7 @@ export class Pane {
     this.element.dataset.done = "";
     if (stack.stable && !this.weights.checked) return;
     await new Promise((resolve) => setTimeout(resolve, stack.stable ? 0 : EXPLAINED_AFTER));
-    if (this.stage.told === told && !this.stage.player.playing) this.markWeights();
+    if (this.stage.told === told && this.stage.player.atEnd) this.markWeights();
   }
 
   private markWeights(): void {

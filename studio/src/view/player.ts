@@ -1,4 +1,5 @@
-// Plays frames of poses: smoothly between them, at their rate, as they come.
+// Plays frames of poses: smoothly between them, at their rate, as they come. Where somebody wants less motion, only
+// what they start themselves is played; else its end is shown.
 
 import type { Clip, Pose } from "../types";
 
@@ -9,6 +10,7 @@ export class Player {
   playing = false;
   pose: (joints: number[]) => void = () => {}; // the arm
   private waiting = false; // for frames that are still to come
+  private hurried = false; // straight to the end
   private ended: () => void = () => {};
 
   constructor(
@@ -17,17 +19,18 @@ export class Player {
     private readonly moved: (player: Player) => void = () => {},
   ) {}
 
-  /** Plays a clip from its beginning; the promise says that it was played to its end. */
+  /** Plays a clip from its beginning; the promise says that it was played, or that somebody chose another moment. */
   play(clip: Clip, more = false): Promise<void> {
-    Object.assign(this, { clip, time: 0, playing: true, waiting: more });
+    const hurried = matchMedia("(prefers-reduced-motion: reduce)").matches;
+    Object.assign(this, { clip, time: 0, playing: true, waiting: more, hurried });
     this.ended();
     this.awake();
     return new Promise((resolve) => (this.ended = resolve));
   }
 
-  /** Says that no more frames come. */
-  finish(): void {
-    this.waiting = false;
+  /** Says that frames came, and whether more are still to come. */
+  grown(more: boolean): void {
+    this.waiting = more;
     this.awake();
   }
 
@@ -40,11 +43,17 @@ export class Player {
     this.playing = false;
     this.time = Math.max(0, Math.min(this.duration, time));
     this.draw();
+    this.ended();
+  }
+
+  get atEnd(): boolean {
+    return !this.playing && this.time >= this.duration;
   }
 
   toggle(): void {
     if (!this.playing && this.time >= this.duration) this.time = 0;
     this.playing = !this.playing;
+    this.hurried = false;
     this.draw();
     this.awake();
   }
@@ -52,15 +61,15 @@ export class Player {
   /** Lets time pass; answers whether there is more to show. */
   step(seconds: number): boolean {
     if (!this.playing) return false;
-    this.time = Math.min(this.duration, this.time + seconds * this.speed);
+    this.time = this.hurried ? this.duration : Math.min(this.duration, this.time + seconds * this.speed);
     this.draw();
-    if (this.time >= this.duration && !this.waiting) {
+    if (this.time < this.duration) return true;
+    if (!this.waiting) {
       this.playing = false;
       this.moved(this);
       this.ended();
-      return false;
     }
-    return true;
+    return false;
   }
 
   private draw(): void {

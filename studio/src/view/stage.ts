@@ -7,6 +7,7 @@ import { Player } from "./player";
 import { World } from "./world";
 
 const SLOT = 5.5; // distance of stacks side by side [cell]
+const FARTHEST = 9; // from the middle at which blocks are still looked at: the edge of the table [cell]
 
 export type Tone = "" | "stands" | "falls" | "busy";
 
@@ -75,6 +76,8 @@ export class Stage {
   async playRollout(clip: Clip, told: Told): Promise<void> {
     this.still();
     this.told = told;
+    const reach = Math.max(...clip.frames.at(-1)!.flatMap(([x, y]) => [Math.abs(x), Math.abs(y)]));
+    this.world.widen(2 * Math.min(FARTHEST, reach + 1));
     await this.playClip(clip);
   }
 

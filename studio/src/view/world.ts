@@ -21,7 +21,7 @@ export class World {
   private poses: Pose[] = [];
   private explosion = 0;
   private asked = false;
-  private last = 0;
+  private last = 0; // moment of the last frame of what goes on; 0 at its beginning [ms]
   private size: [number, number] = [4, 4]; // of what is looked at [cell]
 
   constructor(shapes: Shape[]) {
@@ -127,15 +127,21 @@ export class World {
     this.paint();
   }
 
+  /** Steps back, where something wider is to be seen. */
+  widen(width: number): void {
+    if (width > this.size[0]) this.home(width);
+  }
+
   /** Draws again soon. */
   paint(): void {
     if (this.asked) return;
     this.asked = true;
     requestAnimationFrame((now) => {
       this.asked = false;
-      const seconds = Math.min(0.5, (now - this.last) / 1000);
-      this.last = now;
-      if (this.onFrame(seconds)) this.paint();
+      const seconds = this.last ? Math.min(0.5, (now - this.last) / 1000) : 1 / 60;
+      const goesOn = this.onFrame(seconds);
+      this.last = goesOn ? now : 0;
+      if (goesOn) this.paint();
       this.renderer.render(this.scene, this.camera);
     });
   }
