@@ -121,9 +121,10 @@ class Gallery:
                     return
                 files, folders = _listed(folder)
                 below += folders
+                tables = any(file.suffix == ".csv" for file in files)
                 for file in files:
                     kind = _kind(file)
-                    if kind is not None:
+                    if kind is not None and (kind != "report" or tables):  # beside no table it is prose
                         path = file.relative_to(self.root)
                         yield Item(hashlib.sha256(os.fsencode(path)).hexdigest()[:16], kind, path)
             level = below

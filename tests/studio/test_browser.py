@@ -43,6 +43,7 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A studio that runs, with one result to show."""
     results = tmp_path_factory.mktemp("results")
     shutil.copy("examples/stacks/cantilever.json", results / "stacks.json")
+    (results / "report.csv").write_text("a\n7\n")
     (results / "report.md").write_text("| a |\n| - |\n| 7 |\n")
     command = [sys.executable, "-m", "stackgen", "studio", "--port", "0", "--workers", "2", "--gallery", str(results)]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}

@@ -96,6 +96,7 @@ export class Building {
     const running = (this.running = new AbortController());
     this.go.hidden = true;
     this.stop.hidden = false;
+    this.stop.textContent = "Stop";
     this.starts = [];
     const clip: Clip & { joints: number[][] } = { frames: [], joints: [], rate: 12 };
     const { stage } = this;
@@ -113,7 +114,7 @@ export class Building {
           if (running.signal.aborted) return;
           stage.present(message.shapes, this.stack!.poses);
           stage.world.table.add(this.arm.object);
-          stage.world.home(9, 9);
+          stage.world.home(11, 12);
           this.starts.push(0);
           this.back.hidden = this.next.hidden = false;
         } else if (message.kind === "motion") {
@@ -145,6 +146,7 @@ export class Building {
       await played;
       if (running.signal.aborted) return;
       stage.say(last ? "built, and stands" : "does not stand", last ? "stands" : "falls");
+      this.stop.textContent = "Take the arm away";
       this.element.dataset.built = "";
     } catch (error) {
       if (running.signal.aborted && isAbort(error)) return;
