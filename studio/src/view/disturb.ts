@@ -16,7 +16,7 @@ const MOST_PUSH = 2; // [weights of the block]
 class Track {
   readonly slider: HTMLInputElement;
   readonly element: HTMLElement;
-  private readonly value = el("output");
+  private readonly value = el("span", { class: "value" });
   private readonly limit = el("span", { class: "limit" });
   private readonly fall = el("span", { class: "limit fall" });
 
@@ -42,7 +42,7 @@ class Track {
 export class Disturbances {
   readonly element: HTMLElement;
   private readonly tilted = new Track("Tilt the table", "Tilt of the table in degrees", MOST_TILT, 0.5, (value) => `${value.toFixed(1)}°`);
-  private readonly pushed = new Track("Push a block", "Push in weights of the block", MOST_PUSH, 0.05, (value) => `${value.toFixed(2)} × its weight`);
+  private readonly pushed = new Track("Push a block", "Push in weights of the block", MOST_PUSH, 0.05, (value) => `${value.toFixed(2)} × weight`);
   private readonly answer = el("p", { class: "answer", role: "status" });
   private readonly block = choice([], "", () => void this.push());
   private tiltDirection = "0";
@@ -90,7 +90,7 @@ export class Disturbances {
     this.block.replaceChildren(...stack.shapes.map((shape, i) => el("option", { value: i }, `${i + 1} ${names[shape]!.replaceAll("_", " ")}`)));
     this.block.value = String(stack.shapes.length - 1);
     this.tilted.markLimit(stack.statics.margin, "");
-    this.pushed.markLimit(stack.statics.push ?? 0, ", the weakest block");
+    this.pushed.markLimit(stack.statics.push ?? 0, ", weakest block");
   }
 
   /** Forgets what was asked; the sliders go back. */
