@@ -114,8 +114,8 @@ def drawn(page: Any) -> str:
 
 def generate(page: Any, compared: str = "") -> None:
     page.select_option("#compared", compared)
-    page.get_by_label("Structures", exact=True).fill("1")
-    page.get_by_label("Structures", exact=True).blur()
+    page.locator("#number").fill("1")
+    page.locator("#number").blur()
     page.get_by_role("button", name="Generate").click()
     page.locator(".pane[data-done]").nth(1 if compared else 0).wait_for()
 

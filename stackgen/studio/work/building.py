@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 from xml.etree.ElementTree import Element, fromstring
 
@@ -41,7 +42,8 @@ def ordered(request: StackRequest, send: Send) -> None:
         StackgenError: If it cannot be built: the message says why.
     """
     content, entry = chosen_stack(request)
-    found = design(entry.stack, Workcell(), physics_of(content))
+    with _words_of_the_page():
+        found = design(entry.stack, Workcell(), physics_of(content))
     send({"order": list(found.order.blocks), "margins": [round(margin, 1) for margin in found.order.margins]})
 
 
@@ -57,9 +59,10 @@ def built(request: StackRequest, send: Send) -> None:
             raise StackgenError(f"this structure cannot be built: {misfit.text}")
     k, workcell, physics = len(entry.stack), Workcell(), physics_of(content)
     send({"kind": "planned", "blocks": 0, "of": k})
-    plan = plan_stack(
-        entry.stack, workcell, physics, on_block=lambda done: send({"kind": "planned", "blocks": done, "of": k})
-    )
+    with _words_of_the_page():
+        plan = plan_stack(
+            entry.stack, workcell, physics, on_block=lambda done: send({"kind": "planned", "blocks": done, "of": k})
+        )
     order = [step.block for step in plan.plan.blocks]
     send({"kind": "order", "order": order, "shapes": plan.plan.stack.shapes.tolist(), "rate": RATE})
     report = build(
@@ -78,6 +81,16 @@ def built(request: StackRequest, send: Send) -> None:
             "unplanned": list(report.unplanned),
         }
     )
+
+
+@contextmanager
+def _words_of_the_page() -> Iterator[None]:
+    """Name the way out that the page has where an error names an option of the command line."""
+    try:
+        yield
+    except StackgenError as error:
+        why, option, _ = str(error).partition("; --")
+        raise StackgenError(f"{why}; choose another structure" if option else why) from error
 
 
 class _Camera:

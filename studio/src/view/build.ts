@@ -5,7 +5,7 @@ import { button, choice, el, labelled } from "../dom";
 import type { Clip, Pose, StackFacts, StacksFile } from "../types";
 import { Arm } from "./arm";
 import type { Stage } from "./stage";
-import { number } from "./why";
+import { countedFromOne, number } from "./why";
 
 type BuildMessage =
   | { kind: "planned"; blocks: number; of: number }
@@ -87,7 +87,7 @@ export class Building {
       this.stage.world.mark([], (block) => !placed.includes(block));
       this.status.textContent = placed.length ? `Block ${placed.at(-1)! + 1} is number ${placed.length} to be placed.` : "Nothing is placed yet.";
     } catch (error) {
-      this.status.textContent = told(error);
+      this.status.textContent = countedFromOne(told(error));
     }
   }
 
@@ -151,7 +151,7 @@ export class Building {
     } catch (error) {
       if (running.signal.aborted && isAbort(error)) return;
       this.reset();
-      this.status.textContent = told(error);
+      this.status.textContent = countedFromOne(told(error));
     }
   }
 

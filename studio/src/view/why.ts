@@ -20,7 +20,12 @@ export function why(stack: StackFacts, shapes: Shape[]): HTMLElement {
 
 function phrase(reason: string): string {
   if (reason.startsWith("centre of mass")) return `has its ${reason}: nothing holds it there`;
-  return reason.replace(/block (\d+)/g, (_, n) => `block ${Number(n) + 1}`).replace(/ and (\d+)/g, (_, n) => ` and ${Number(n) + 1}`);
+  return countedFromOne(reason);
+}
+
+/** Numbers of blocks as the page has them. */
+export function countedFromOne(text: string): string {
+  return text.replace(/block (\d+)/g, (_, n) => `block ${Number(n) + 1}`).replace(/ and (\d+)/g, (_, n) => ` and ${Number(n) + 1}`);
 }
 
 export function capital(text: string): string {
