@@ -62,7 +62,10 @@ export class Building {
   reset(): void {
     this.running?.abort();
     this.running = null;
-    if (this.arm) this.stage.world.table.remove(this.arm.object);
+    if (this.arm) {
+      this.stage.world.table.remove(this.arm.object);
+      this.stage.present(this.stack!.shapes, this.stack!.frames[0]!); // the blocks are where they were fetched
+    }
     this.arm = null;
     this.stage.player.speed = 1;
     this.status.textContent = "";
@@ -80,7 +83,10 @@ export class Building {
         if (this.stack !== stack) return;
         this.placing = found.order;
       }
-      const placed = this.placing.slice(0, Number(this.order.value));
+      const wanted = this.order.value;
+      if (this.arm) this.reset();
+      this.order.value = wanted;
+      const placed = this.placing.slice(0, Number(wanted));
       this.begins();
       this.stage.still();
       this.stage.world.pose(stack.poses);
@@ -128,7 +134,7 @@ export class Building {
             stage.player.pose = (joints) => this.arm?.pose(joints);
             stage.player.speed = Number(this.speed.value);
             stage.say("building", "busy");
-            played = stage.playClip(clip, true);
+            played = stage.player.play(clip, true);
           }
           stage.player.grown(true);
         } else if (message.kind === "placed") {

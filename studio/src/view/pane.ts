@@ -85,7 +85,7 @@ export class Pane {
           frames.push(arrange(message.stacks));
           if (!noise) {
             this.element.dataset.firstFrame = String(Math.round(performance.now() - began));
-            noise = this.stage.playClip({ frames, rate: NOISE_RATE }, true);
+            noise = this.stage.player.play({ frames, rate: NOISE_RATE }, true);
           }
           this.stage.player.grown(message.step < message.steps);
         } else if (message.kind === "checked") {
@@ -169,7 +169,6 @@ export class Pane {
     this.shown = number;
     [...this.tabs.children].forEach((tab, i) => tab.setAttribute("aria-pressed", String(i === number)));
     const stack = this.stacks[number]!;
-    this.stage.present(stack.shapes, stack.frames[0]!);
     const size = this.file.file.grid.image_size;
     this.facts.replaceChildren(
       ...this.file.notes.map((note) => el("p", { class: "note" }, note)),
@@ -179,6 +178,7 @@ export class Pane {
     this.building.take(this.file.file, number, stack);
     this.disturbances.take(this.file.file, number, stack, this.shapes.map((shape) => shape.name));
     this.tools.hidden = false;
+    this.stage.present(stack.shapes, stack.frames[0]!);
     void this.drop();
   }
 

@@ -68,17 +68,13 @@ export class Stage {
     this.world.pose(poses);
   }
 
-  async playClip(clip: Clip, more = false): Promise<void> {
-    await this.player.play(clip, more);
-  }
-
   /** Plays what the simulator saw; when it stops, the badge tells the verdict. */
   async playRollout(clip: Clip, told: Told): Promise<void> {
     this.still();
     this.told = told;
     const reach = Math.max(...clip.frames.at(-1)!.flatMap(([x, y]) => [Math.abs(x), Math.abs(y)]));
     this.world.widen(2 * Math.min(FARTHEST, reach + 1));
-    await this.playClip(clip);
+    await this.player.play(clip);
   }
 
   /** Shows the beginning or the end of a rollout, and its verdict. */
