@@ -21,7 +21,7 @@ from stackgen.protocols import BlockListPredictor, StabilityChecker, StackSample
 from stackgen.sampling.alignment import AlignedSampler
 from stackgen.stack import Stack, check_block_list, parse_block_list
 from stackgen.vision.drawings import grid_offset
-from stackgen.vision.reader import read_silhouette
+from stackgen.vision.reader import Reading, read_silhouette
 from stackgen.world import Grid, Mask, World
 
 if TYPE_CHECKING:
@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from stackgen.sampling.verified import Budget
     from stackgen.sim.physics import Physics
 
-Silhouette = str | Path | NDArray[Any]
-"""An image file; a (H, W) array, boolean with True where the structure is, or grey; or a colour (H, W, 3 or 4) one."""
+Silhouette = str | Path | NDArray[Any] | Reading
+"""An image file; a (H, W) array, boolean with True where the structure is, or grey; a colour (H, W, 3 or 4) one; or
+what was read in a picture, which keeps its scale where that is known."""
 
 BlockList = str | Mapping[str, int] | NDArray[np.int64]
 """`"cube=3,triangle=1"`, `{"cube": 3, "triangle": 1}` or counts (S,) in catalogue order."""
@@ -203,6 +204,8 @@ class Model:
 
     def read(self, silhouette: Silhouette) -> Mask:
         """Read the (H, W) silhouette in an image, scaled and placed as the model knows them."""
+        if isinstance(silhouette, Reading):
+            return silhouette.silhouette(self.world.grid)
         return read_silhouette(silhouette, self.world.grid)
 
     def predict_blocks(self, silhouette: Silhouette, inventory: Inventory | None = None) -> NDArray[np.int64]:

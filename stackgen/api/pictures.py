@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -19,6 +19,7 @@ from stackgen.search.problem import SearchSettings
 from stackgen.search.sampler import SearchSampler
 from stackgen.search.scale import MOST_BLOCKS, Cells
 from stackgen.stack import Stack
+from stackgen.vision.cells import squared
 from stackgen.vision.reader import Reading, read_picture
 from stackgen.world import Mask
 
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def best(
-    silhouette: Silhouette | Reading,
+    silhouette: Silhouette,
     num_samples: int = 3,
     seed: int = 0,
     blocks: BlockList | None = None,
@@ -71,8 +72,10 @@ def best(
     there = None if inventory is None else asked.inventory(inventory)
     reading = silhouette if isinstance(silhouette, Reading) else read_picture(silhouette, asked.world.grid)
     asked_cells = Cells.parse(cells)
-    if asked_cells == Cells() and reading.cell is not None:
-        asked_cells = Cells(max(1, round(len(reading.figure) / reading.cell)))
+    noted = len(reading.notes)
+    if asked_cells == Cells():
+        reading = squared(reading, asked.world.grid)
+        asked_cells = Cells(None if reading.cell is None else max(1, round(len(reading.figure) / reading.cell)))
     on_step()
     found = best_stacks(
         reading,
@@ -99,7 +102,7 @@ def best(
         seed=seed,
         sampler=SearchSampler(search=search).settings,
         cell_size=physics.cell_size,
-        comment=_told(found, num_samples),
+        comment=_told(found, num_samples, reading.notes[noted:]),
     )
 
 
@@ -113,9 +116,10 @@ def _network() -> Model:
     return load()
 
 
-def _told(found: Best, wanted: int) -> str:
-    """Say where the stacks come from, and why they may be fewer or worse than asked."""
-    told = [f"stacks proposed: {found.asked[0]} by search, {found.asked[1]} by the network"]
+def _told(found: Best, wanted: int, notes: Sequence[str]) -> str:
+    """Say what was made of the picture, where the stacks come from, and why they may be fewer or worse than asked."""
+    told = [note[0].lower() + note[1:-1] for note in notes]
+    told += [f"stacks proposed: {found.asked[0]} by search, {found.asked[1]} by the network"]
     if len(found.chosen) < wanted:
         told.append(f"no more than {len(found.chosen)} of {wanted} layouts fit nearly as well as the best")
     if found.late:

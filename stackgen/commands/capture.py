@@ -17,7 +17,7 @@ from stackgen.geometry import silhouette as silhouette_of
 from stackgen.io.stacks_file import read_stacks
 from stackgen.stack import format_block_list
 from stackgen.vision.cameras import Rig, realsense_frame, simulated_frame
-from stackgen.vision.cells import Ints, in_cells
+from stackgen.vision.cells import Ints, in_cells, squared
 from stackgen.vision.depth import DepthFrame
 from stackgen.vision.images import Picture
 from stackgen.vision.masks import fitted
@@ -115,10 +115,11 @@ def _read(source: Source, picture: PictureOptions, image: Path | None) -> tuple[
 
 def _found(reading: Reading, freehand: bool) -> tuple[Mask, list[str]]:
     """Set what was read on the paper's grid, in cells where it is made of them; say what was found."""
+    as_seen = reading.silhouette(PAPER_GRID)
+    reading = reading if freehand else squared(reading, PAPER_GRID)
     lines = [f"read as a {reading.describe()}", *reading.notes]
     known = None if reading.cell is None else reading.height(PAPER_GRID)
     silhouette, cells, block_list = in_cells(reading.figure, PAPER_GRID, known)
-    as_seen = reading.silhouette(PAPER_GRID)
     return (as_seen if freehand else silhouette), [*lines, *_made_of(cells, block_list)]
 
 

@@ -45,7 +45,7 @@ def of_model(model: Model, asked: dict[str, Any], verify: CheckerName | None, bu
         sample = partial(model.sample_verified, **asked, verify=verify, budget=Budget.parse(budget) if budget else None)
 
     def draw(image: Path, reading: Reading) -> StacksFile:
-        return replace(sample(reading.silhouette(model.world.grid)), silhouette=image.name)
+        return replace(sample(reading), silhouette=image.name)
 
     return draw
 

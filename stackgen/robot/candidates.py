@@ -11,6 +11,7 @@ from stackgen.io.stacks_file import StacksFile
 from stackgen.robot.build import PlannedBuild
 from stackgen.sampling.best import within
 from stackgen.sampling.verified import Budget
+from stackgen.search.problem import SearchSettings
 from stackgen.stack import Stack
 from stackgen.vision.reader import Reading
 
@@ -42,8 +43,8 @@ def stacks_of_picture(
         inventory: Blocks that there are, such as `cube=4,rectangle=3`.
         budget: Time such as `5s`, or number of stacks, that finding a stack may cost.
         seed: Seed of the stacks.
-        most: Number of blocks that there is room for where the robot takes them from: of a picture for which a stack
-            needs more the next smaller scale is tried.
+        most: Number of blocks that there is room for where the robot takes them from: of a picture whose best stacks
+            need more the best at a smaller scale are taken.
         on_step: Called at most `NUMBER + 1` times, as the work proceeds.
 
     Raises:
@@ -51,20 +52,36 @@ def stacks_of_picture(
     """
     limit = None if budget is None else Budget.parse(budget)
     if model is None:
-        search = within(limit)
-        for cells in ("auto", *map(str, SCALES)):
-            found = best(reading, NUMBER, seed, inventory=inventory, cells=cells, search=search)
-            on_step()
-            if most is None or any(len(stack) <= most for stack in found.stacks):
-                break
+        found = _at_best_scale(reading, seed, inventory, within(limit), most, on_step)
     else:
-        target = reading.silhouette(model.world.grid)
-        found = model.sample_verified(target, NUMBER, seed, inventory=inventory, budget=limit, on_step=on_step)
+        found = model.sample_verified(reading, NUMBER, seed, inventory=inventory, budget=limit, on_step=on_step)
     standing = tuple(entry for entry in found.entries if entry.verdict is not None and entry.verdict.stable)
     standing = tuple(entry for entry in standing if most is None or len(entry.stack) <= most) or standing
     if not standing:
         raise StackgenError(f"{name}: none of the stacks that were tried stands; try a larger --budget")
     return replace(found, entries=standing, silhouette=name)
+
+
+def _at_best_scale(
+    reading: Reading,
+    seed: int,
+    inventory: str | None,
+    search: SearchSettings,
+    most: int | None,
+    on_step: Callable[[], None],
+) -> StacksFile:
+    """Find the best stacks at any scale; where these have too many blocks, those that fit best at the smaller ones."""
+    tried: list[tuple[float, StacksFile]] = []
+    for cells in ("auto", *map(str, SCALES)):
+        found = best(reading, NUMBER, seed, inventory=inventory, cells=cells, search=search)
+        on_step()
+        if most is None:
+            return found
+        few = [entry.front_iou or 0.0 for entry in found.entries if len(entry.stack) <= most]
+        tried.append((max(few, default=-1.0), found))
+        if cells == "auto" and few:
+            break
+    return max(tried, key=lambda pair: pair[0])[1]
 
 
 def first_buildable(stacks: Sequence[Stack], plan: Callable[[Stack], PlannedBuild]) -> PlannedBuild:

@@ -8,6 +8,7 @@ Legend: H x W pixels, rows and half columns from the lower left, S shapes.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from stackgen.geometry import iou
 from stackgen.vision.drawings import grid_offset
 from stackgen.vision.masks import bounding_box, filling, place
+from stackgen.vision.reader import Reading
 from stackgen.world import MAX_BLOCKS, PAPER_CATALOGUE, Grid, Mask
 
 Ints = NDArray[np.int64]
@@ -27,6 +29,13 @@ _CELLS = ((EMPTY, EMPTY), (FULL, FULL), (RISING, FALLING))  # both halves of eac
 
 ALIKE = 0.93
 """Least IoU with the stretched figure for it to count as made of whole cells."""
+
+STRETCH = 1.25
+"""A cell that was drawn by hand is at most this much wider than high, or higher than wide."""
+
+_COST = 0.1  # IoU that a stretch by e costs
+
+_LITTLE = 0.05  # logarithm of a stretch that is none
 
 PIECE = 0.4
 """Edge of a square in which cells may not differ from the figure all over [cell]: a roof is no row of cells."""
@@ -61,6 +70,33 @@ def in_cells(figure: Mask, grid: Grid, high: float | None = None) -> tuple[Mask,
         return place(figure, grid, full), None, None
     whole, rows = picture_of(cells, grid), int((cells != EMPTY).any(axis=1).sum())
     return place(whole[bounding_box(whole)], grid, rows), cells, block_list_of(cells)
+
+
+def squared(reading: Reading, grid: Grid) -> Reading:
+    """Make the cells of a sketch square where its hand drew all of them wider, or higher; then its scale is known, too.
+
+    >>> steps = np.kron(np.tri(3, dtype=bool), np.ones((58, 48), bool))
+    >>> sketch = squared(Reading(steps, "photo", 1.0, np.zeros((9, 9, 3), np.uint8)), Grid())
+    >>> sketch.figure.shape, sketch.cell, sketch.notes
+    ((174, 174), 58.0, ('The cells were drawn 1.2 times as high as wide, and were made square.',))
+    """
+    if reading.kind != "photo" or reading.cell is not None:
+        return reading
+    tall = reading.figure.shape[0] / reading.figure.shape[1]
+    tried = []
+    for high, wide in np.ndindex(grid.height, grid.width):
+        stretch = (wide + 1) / (high + 1) * tall
+        if 1 / STRETCH <= stretch <= STRETCH:
+            size = (round(len(reading.figure) * (wide + 1) / (high + 1)), len(reading.figure))
+            square = cv2.resize(reading.figure.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+            score, _ = _as_cells(place(square, grid, high + 1), grid)
+            tried.append((score - _COST * abs(math.log(stretch)), score, stretch, high + 1, square))
+    _, score, stretch, high, square = max(tried, key=lambda one: one[0], default=(0.0, 0.0, 1.0, 1, reading.figure))
+    if score < ALIKE or abs(math.log(stretch)) < _LITTLE:
+        return reading
+    ratio = f"{stretch:.1f} times as high as wide" if stretch > 1 else f"{1 / stretch:.1f} times as wide as high"
+    note = f"The cells were drawn {ratio}, and were made square."
+    return replace(reading, figure=square, cell=len(square) / high, notes=(*reading.notes, note))
 
 
 def _as_cells(as_read: Mask, grid: Grid) -> tuple[float, Ints]:

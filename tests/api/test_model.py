@@ -86,6 +86,17 @@ def test_the_command_line_answers_as_the_library(
     assert [e.front_iou for e in written.entries] == [e.front_iou for e in result.entries]
 
 
+def test_with_the_size_of_a_cell_weights_are_asked_for_the_structure_at_its_scale(
+    cli: Cli, tiny: TinyWeights, tmp_path: Path
+) -> None:
+    frame = Path(__file__).parents[2] / "examples" / "photos" / "stack-castle-depth.png"
+    for size, cells in ((0.05, 4), (0.067, 3)):
+        answer = cli("sample", frame, "--cell_size", size, "--num_samples", 1, "--out", tmp_path / "out", *tiny.options)
+        assert answer.code == 0, answer.err
+        target = read_stacks(tmp_path / "out" / "stacks.json").target
+        assert target is not None and np.count_nonzero(target.any(axis=1)) == pytest.approx(14 * cells, abs=3)
+
+
 def test_what_falls_has_no_iou_and_what_stands_has_its_silhouettes(towers: Model) -> None:
     tower = Stack(np.array([0, 0]), np.array([[0, 0, 0.5, 0, 0, 0], [0, 0, 1.5, 0, 0, 0]]))
     floating = tower.with_poses(tower.poses + [0, 0, 2, 0, 0, 0])

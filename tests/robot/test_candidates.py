@@ -10,13 +10,16 @@ import pytest
 
 from stackgen.api import Model
 from stackgen.errors import StackgenError
+from stackgen.io.stacks_file import StackEntry, StacksFile
+from stackgen.protocols import Verdict
+from stackgen.robot import candidates
 from stackgen.robot.build import plan_stack
 from stackgen.robot.candidates import NUMBER, first_buildable, stacks_of_picture
 from stackgen.robot.workcell import Staging, Workcell
 from stackgen.sim.physics import Physics
 from stackgen.stack import Stack
 from stackgen.vision.reader import read_picture
-from stackgen.world import PAPER_GRID
+from stackgen.world import PAPER_GRID, PAPER_WORLD
 from tests.conftest import TowerSampler
 
 ROOT = Path(__file__).parents[2]
@@ -55,6 +58,22 @@ def test_a_picture_of_which_no_stack_stands_is_one_line(towers: Model, monkeypat
     arch = read_picture(ROOT / "examples" / "silhouettes" / "arch.png", PAPER_GRID)
     with pytest.raises(StackgenError, match="none of the stacks that were tried stands; try a larger --budget"):
         stacks_of_picture(arch, "arch.png", towers, budget="3")
+
+
+def test_where_the_best_stacks_have_too_many_blocks_the_best_of_the_smaller_ones_are_taken(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    answers = {"auto": (17, 0.96), "5": (10, 0.84), "4": (7, 0.91), "3": (5, 0.82)}  # blocks and IoU by cells
+
+    def best(*_: object, cells: str, **__: object) -> StacksFile:
+        blocks, overlap = answers[cells]
+        stack = Stack(np.zeros(blocks, np.int64), np.zeros((blocks, 6)))
+        verdict = Verdict(True, np.zeros(blocks, bool), np.zeros(blocks), stack)
+        return StacksFile((StackEntry(stack, verdict, overlap),), PAPER_WORLD)
+
+    monkeypatch.setattr(candidates, "best", best)
+    wall = read_picture(np.pad(np.ones((60, 60), bool), 9), PAPER_GRID)
+    assert [len(stacks_of_picture(wall, "a", most=most).entries[0].stack) for most in (17, 12, 5)] == [17, 7, 5]
 
 
 def test_the_work_proceeds_in_no_more_steps_than_were_told_however_many_scales_are_tried() -> None:
