@@ -112,6 +112,7 @@ export class SettingsForm {
       this.build();
     });
     mode.id = "blocks";
+    mode.setAttribute("aria-label", "Blocks");
     const counters = el("div", { class: "counters" });
     this.counters = {};
     start.shapes.forEach(({ name, colour }) => {

@@ -28,7 +28,7 @@ export function show({ title, shapes, stacks }: Shown): void {
     stage.holdRollout({ frames: [stack.sampled, stack.settled], rate: 1 / SETTLING }, told, false);
   };
   const tabs = el("div", { class: "tabs", role: "group", "aria-label": "Stacks" });
-  stacks.forEach(({ stable }, i) => tabs.append(button(String(i + 1), () => choose(i), { class: stable === undefined ? "" : stable ? "stands" : "falls", "aria-label": `Stack ${i + 1}` })));
+  stacks.forEach(({ stable }, i) => tabs.append(button(String(i + 1), () => choose(i), { class: stable === undefined ? "" : stable ? "stands" : "falls" })));
   document.body.className = "shown";
   document.body.append(el("header", {}, el("h1", {}, title), tabs), stage.element, facts);
   stage.world.colour();

@@ -130,7 +130,9 @@ export class Pane {
   private clear(method: Method): void {
     this.stacks = [];
     this.file = null;
-    this.tools.hidden = true;
+    this.element.classList.add("asked"); // what comes has its place from now on, so that nothing jumps
+    this.tools.hidden = false;
+    this.tools.inert = true;
     this.title.textContent = method.title;
     this.state.textContent = "";
     this.stage.say("asking …", "busy");
@@ -144,6 +146,7 @@ export class Pane {
 
   private refuse(sentence: string): void {
     this.stage.say("no answer", "falls");
+    this.tools.hidden = true;
     this.facts.replaceChildren(el("p", { class: "error", role: "alert" }, sentence));
   }
 
@@ -158,9 +161,10 @@ export class Pane {
   private add({ number, ...stack }: Extract<Message, { kind: "stack" }>): void {
     this.stacks.push(stack);
     const match = stack.front_iou === null ? "" : ` · IoU ${stack.front_iou.toFixed(2)}`;
-    const text = `${number + 1}${stack.stable ? match : " · falls"}`;
+    const text = stack.stable ? [`${number + 1}${match}`, el("span", { class: "visually-hidden" }, ", stands")] : [`${number + 1} · falls`];
     const verdict = stack.stable ? "stands" : "falls";
-    const tab = button(text, () => this.choose(number), { class: verdict, "aria-pressed": "false", "aria-label": `Structure ${number + 1}, ${verdict}` });
+    const tab = button("", () => this.choose(number), { class: verdict, "aria-pressed": "false" });
+    tab.append(...text);
     this.tabs.append(tab);
   }
 
@@ -177,7 +181,7 @@ export class Pane {
     this.share.replaceChildren(downloads(this.file, number, this.stage.world));
     this.building.take(this.file.file, number, stack);
     this.disturbances.take(this.file.file, number, stack, this.shapes.map((shape) => shape.name));
-    this.tools.hidden = false;
+    this.tools.inert = false;
     this.stage.present(stack.shapes, stack.frames[0]!);
     void this.drop();
   }
