@@ -134,6 +134,13 @@ def test_the_sides_of_a_block_tell_that_the_ground_line_is_its_base() -> None:
     assert iou(found.mask, solid(base, top)) > 0.95 and "ground line" in " ".join(found.notes)
 
 
+def test_the_top_of_a_block_that_sticks_out_is_no_ground_line() -> None:
+    base, top = box(150, 300, 400, 400), box(150, 200, 300, 300)
+    ink = drawn(base, top, width=8)
+    ink[399:408, 20:560] = True
+    assert iou(choose(ink).mask, solid(base, top)) > 0.95
+
+
 def test_a_drawing_that_runs_off_is_not_replaced_by_less_without_a_word() -> None:
     ink = drawn(np.array([[0, 100], [300, 100], [300, 400], [0, 400]]), box(420, 100, 500, 180))
     assert "uncertain" in " ".join(choose(ink).notes)

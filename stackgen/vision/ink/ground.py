@@ -27,7 +27,7 @@ def without_ground(ink: Mask) -> list[Mask]:
     if foot is None:
         return []
     more, again = _off_ground(body)  # beyond a drawing that is filled in the line is found anew
-    if again is not None and again[0].stop > foot[0].stop - _NEAR * extent(ink):
+    if again is not None and bounding_box(body & ~more)[0].start > foot[0].stop - _NEAR * extent(ink):
         body, foot = more, again
     under = body.copy()
     under[:, foot[1]] = ink[:, foot[1]]
