@@ -73,6 +73,7 @@ async function begin(): Promise<void> {
   };
   byId("to-studio").addEventListener("click", () => turn("studio"));
   byId("to-gallery").addEventListener("click", () => turn("gallery"));
+  byId("studio").hidden = false; // all of it at once, so that nothing jumps
   themes(() => {
     pad.paint();
     panes.forEach((pane) => pane.stage.world.colour());
@@ -102,7 +103,7 @@ async function open(): Promise<void> {
     if (stacks) show(JSON.parse(stacks.textContent!));
     else await begin();
   } catch (error) {
-    (document.getElementById("panes") ?? document.body).replaceChildren(el("p", { class: "error", role: "alert" }, told(error)));
+    document.body.replaceChildren(el("p", { class: "error", role: "alert" }, told(error)));
   }
 }
 
