@@ -62,6 +62,8 @@ def drop_run_without(worth: str, folder: Path) -> None:
     """
     if any(folder.glob(worth)):
         return
+    if (wandb := sys.modules.get("wandb")) is not None and wandb.run is not None:
+        wandb.finish(exit_code=1)  # else it writes into the folder once more at the end
     shutil.rmtree(folder, ignore_errors=True)
     with contextlib.suppress(OSError):  # they hold other runs
         folder.parent.rmdir()

@@ -188,6 +188,17 @@ def test_a_command_that_fails_leaves_no_run_folder(cli: Cli, config: Path) -> No
     assert [path.name for path in Path("runs/tiny").iterdir()] == ["version_0"]
 
 
+@pytest.mark.slow
+def test_nothing_is_left_of_a_run_that_wandb_had_begun(config: Path) -> None:
+    """In a process of its own, since wandb writes into a run's folder as a process ends."""
+    endless = ["--trainer.max_steps", "-1", "--trainer.max_epochs", "-1", "--trainer.max_time", "00:00:00:05"]
+    options = ["fit", "--config", str(config), "--dashboard", "wandb-offline", *endless]
+    command = [sys.executable, "-m", "stackgen", *options]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert answer.returncode == 2 and "give max_steps or max_epochs" in answer.stderr, answer.stderr
+    assert not Path("runs").exists()
+
+
 def test_validate_finds_the_configuration_beside_the_checkpoint(cli: Cli, config: Path) -> None:
     assert cli("fit", "--config", config).code == 0
     answer = cli("validate", "--ckpt_path", "runs/tiny/version_0/checkpoints/last.ckpt")
