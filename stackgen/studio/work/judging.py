@@ -227,15 +227,16 @@ def _disturbed(
         pull = Pull(lambda time: forces(k, min(amount, rate * time)), amount / rate)
         return recorder.rollout(entry.stack, pull, until_fall)
 
-    rollout, reached, fell_at = up_to(most, until_fall=True), most, None
+    rollout, reached, fell_at, seen = up_to(most, until_fall=True), most, None, None
     verdict = judged(rollout, physics)
     if not verdict.stable:
         first, frame = first_to_go(rollout, verdict) or 0, rate * recorder.every * physics.step
         fell_at = round(min(most, frame * _held_until(rollout, first)), 2)
-        reached = min(most, frame * int(_left(rollout)[first]))  # the hand that sees it go stops there
-        rollout = up_to(reached, until_fall=False)
-    facts = {"reached": reached, "growth": rate, "fell_at": fell_at}
-    send({"shapes": entry.stack.shapes.tolist(), **rollout_facts(rollout, physics), **facts})
+        left = int(_left(rollout)[first])
+        reached = min(most, frame * left)  # the hand that sees it go stops there
+        rollout, seen = up_to(reached, until_fall=False), left + FRAMES  # later, all may have slid off the table
+    facts = {**rollout_facts(rollout, physics), "reached": reached, "growth": rate, "fell_at": fell_at}
+    send({"shapes": entry.stack.shapes.tolist(), **facts, "frames": facts["frames"][:seen]})
 
 
 def checked(request: StackRequest, send: Callable[[Message], None]) -> None:
