@@ -182,17 +182,22 @@ def _borders(
         count: Number of regions R.
 
     Returns:
-        (R, R) by how much one is lighter than another across their border, and (R, R) how long that is [pixel].
+        (R, R) by how much one is lighter than another across their border, and (R, R) how long that is [pixel]; 0 to
+        one that has strokes around it nearly everywhere, as a face of an outline has.
     """
-    steps, lengths = np.zeros(count * count), np.zeros(count * count)
+    steps, lengths, around = np.zeros(count * count), np.zeros(count * count), np.zeros(count)
     for one, two in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
         for here, there in ((one, two), (two, one)):
             stroke = low[here] < np.minimum(levels[here], levels[there]) - _SHARP / 2
-            differs = (regions[here] != regions[there]) & ~stroke
+            differs = regions[here] != regions[there]
+            around += np.bincount(regions[here][differs], minlength=count)
+            differs &= ~stroke
             pairs = regions[here][differs].astype(np.int64) * count + regions[there][differs]
             steps += np.bincount(pairs, (levels[here] - levels[there])[differs], count * count)
             lengths += np.bincount(pairs, minlength=count * count)
-    return (steps / np.maximum(lengths, 1)).reshape(count, count), lengths.reshape(count, count)
+    told = lengths.reshape(count, count)
+    enough = told.sum(axis=1) >= around / 3
+    return (steps / np.maximum(lengths, 1)).reshape(count, count), told * enough[:, None]
 
 
 def _darker(steps: Floats, lengths: Floats, paper: NDArray[np.bool_]) -> NDArray[np.bool_]:
