@@ -27,7 +27,7 @@ from stackgen.world import World
 
 FORMAT = "stackgen.weights/1"
 FOLDER = Path(__file__).parents[1] / "assets" / "weights"
-DEFAULTS = {"sampler": "ddpm-verdicts", "predictor": "taught-blocklist"}
+DEFAULTS = {"sampler": "taught-verdicts", "predictor": "taught-blocklist"}
 """What the name `default` stands for."""
 
 CHECKPOINT_KEY = "stackgen"

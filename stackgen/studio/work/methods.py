@@ -14,6 +14,7 @@ BEST = "best"
 """Search and network together, as `stackgen sample` asks them."""
 
 _TITLES = {
+    "taught-verdicts": "StackGen: diffusion, taught by the search",
     "ddpm-verdicts": "StackGen: diffusion",
     "ddpm-small": "Diffusion, without verdicts",
     "ddpm-paper-small": "Diffusion, the paper's recipe",
