@@ -19,10 +19,14 @@ HATCH = 0.02
 
 
 def without_whiskers(mask: Mask, size: int) -> Mask:
-    """Remove what is thin as a hair from something solid: lines of the paper that touch it."""
-    core = opened(mask, HAIR * size)
-    near = cv2.distanceTransform((~core).astype(np.uint8), cv2.DIST_L2, 3) <= HAIR * size
-    return np.asarray(near & mask) if core.any() else mask
+    """Remove what is thin as a hair from something solid: lines of the paper that touch it, but no tip of its own."""
+    reach = HAIR * size
+    core = opened(mask, reach)
+    if not core.any():
+        return mask
+    near = cv2.distanceTransform((~core).astype(np.uint8), cv2.DIST_L2, 3) <= reach
+    parts, areas = components(mask & ~near)
+    return np.asarray(mask & (near | (areas < 0.5 * reach**2)[parts]))
 
 
 def hatched(ink: Mask, size: int) -> Mask:
