@@ -132,8 +132,8 @@ def _of_model(reading: Reading, wish: Wish, send: Send) -> tuple[StacksFile, Rec
     asked["blocks"] = None if wish.blocks is None else _counts(wish.blocks)
     asked["inventory"] = None if wish.inventory is None else _counts(wish.inventory)
     if wish.verified:
-        return model.sample_verified(target, **asked, budget=Budget(DRAWS)), recorder
-    return model.sample_checked(target, **asked), recorder
+        return model.sample_verified(reading, **asked, budget=Budget(DRAWS)), recorder
+    return model.sample_checked(reading, **asked), recorder
 
 
 @lru_cache(maxsize=8)
