@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -32,7 +33,9 @@ def serve(host: str, port: int, workers: int, gallery: Path, ready: Callable[[st
     app = make_app(Workers(workers), Gallery(gallery), (*LOOPBACK, host))
     config = uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=1, ws="none")
     ready(f"http://{shown}:{listening.getsockname()[1]}/")
-    uvicorn.Server(config).run(sockets=[listening])
+    server = uvicorn.Server(config)
+    logging.getLogger("uvicorn.error").addFilter(lambda record: not server.should_exit)  # what the end cuts off
+    server.run(sockets=[listening])
 
 
 def _listen(host: str, port: int) -> socket.socket:

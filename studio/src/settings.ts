@@ -19,7 +19,7 @@ export interface Settings {
 
 export const DEFAULTS: Settings = {
   method: "best",
-  compared: "ddpm-verdicts",
+  compared: "taught-verdicts",
   number: 3,
   seed: 0,
   verified: true,

@@ -11,6 +11,9 @@ import { overlays } from "./overlays";
 import { Stage, type Told } from "./stage";
 import { why } from "./why";
 
+type FileMessage = Extract<Message, { kind: "file" }>;
+type StackMessage = Extract<Message, { kind: "stack" }>;
+
 const EXPLAINED_AFTER = 1500; // [ms] after a fall
 const NOISE_RATE = 14; // frames of denoising in a second
 
@@ -27,7 +30,7 @@ export class Pane {
   private readonly tools: HTMLElement;
   private readonly weights = el("input", { type: "checkbox", change: () => this.markWeights() });
   private stacks: StackFacts[] = [];
-  private file: Extract<Message, { kind: "file" }> | null = null;
+  private file: FileMessage | null = null;
   private shown = 0;
   private shapes: Shape[];
   private running: AbortController | null = null;
@@ -123,6 +126,7 @@ export class Pane {
   }
 
   private use(shapes: Shape[]): void {
+    if (shapes === this.shapes) return;
     this.shapes = shapes;
     this.stage.world.setShapes(shapes);
   }
@@ -150,7 +154,7 @@ export class Pane {
     this.facts.replaceChildren(el("p", { class: "error", role: "alert" }, sentence));
   }
 
-  private take(message: Extract<Message, { kind: "file" }>, began: number | null): void {
+  private take(message: FileMessage, began: number | null): void {
     this.file = message;
     const seconds = began === null ? "" : ` in ${((performance.now() - began) / 1000).toFixed(1)} s`;
     const number = message.file.stacks.length;
@@ -158,13 +162,12 @@ export class Pane {
     if (message.file.block_list) this.onBlocks(message.file.block_list);
   }
 
-  private add({ number, ...stack }: Extract<Message, { kind: "stack" }>): void {
+  private add({ number, ...stack }: StackMessage): void {
     this.stacks.push(stack);
     const match = stack.front_iou === null ? "" : ` · IoU ${stack.front_iou.toFixed(2)}`;
-    const text = stack.stable ? [`${number + 1}${match}`, el("span", { class: "visually-hidden" }, ", stands")] : [`${number + 1} · falls`];
-    const verdict = stack.stable ? "stands" : "falls";
-    const tab = button("", () => this.choose(number), { class: verdict, "aria-pressed": "false" });
-    tab.append(...text);
+    const [text, verdict] = stack.stable ? [match, "stands"] : [" · falls", "falls"];
+    const tab = button(`${number + 1}${text}`, () => this.choose(number), { class: verdict, "aria-pressed": "false" });
+    if (stack.stable) tab.append(el("span", { class: "visually-hidden" }, ", stands"));
     this.tabs.append(tab);
   }
 
@@ -195,7 +198,7 @@ export class Pane {
     await this.stage.playRollout(stack, told);
     this.element.dataset.done = "";
     if (stack.stable && !this.weights.checked) return;
-    await new Promise((resolve) => setTimeout(resolve, stack.stable ? 0 : EXPLAINED_AFTER));
+    if (!stack.stable) await new Promise((resolve) => setTimeout(resolve, EXPLAINED_AFTER));
     if (this.stage.told === told && this.stage.player.atEnd) this.markWeights();
   }
 

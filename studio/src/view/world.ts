@@ -5,6 +5,14 @@ import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 import type { Pose, Shape } from "../types";
 
 const FALLEN = new three.Color(0xd62728);
+const LINES = new three.LineBasicMaterial({ color: 0x2c303a });
+
+interface Block {
+  group: three.Group; // of both others
+  body: three.Mesh<three.BufferGeometry, three.MeshStandardMaterial>;
+  lines: three.LineSegments;
+  colour: three.Color;
+}
 
 export class World {
   readonly canvas: HTMLCanvasElement;
@@ -16,8 +24,8 @@ export class World {
   private readonly scene = new three.Scene();
   private readonly camera = new three.PerspectiveCamera(35, 1, 0.1, 300);
   private readonly controls: OrbitControls;
-  private meshes: { body: three.BufferGeometry; edges: three.BufferGeometry; colour: three.Color }[] = [];
-  private blocks: three.Group[] = [];
+  private meshes: ReturnType<typeof meshOf>[] = []; // of each shape
+  private blocks: Block[] = [];
   private poses: Pose[] = [];
   private explosion = 0;
   private asked = false;
@@ -61,32 +69,28 @@ export class World {
 
   /** Shows blocks of these shapes, all at the origin until they are posed. */
   setBlocks(shapes: number[]): void {
-    for (const block of this.blocks) this.table.remove(block);
-    this.blocks = shapes.map((shape, number) => {
-      const mesh = this.meshes[shape]!;
-      const body = new three.Mesh(mesh.body, new three.MeshStandardMaterial({ color: mesh.colour, roughness: 0.75 }));
+    for (const { group } of this.blocks) this.table.remove(group);
+    this.blocks = shapes.map((shape) => {
+      const { faces, edges, colour } = this.meshes[shape]!;
+      const body = new three.Mesh(faces, new three.MeshStandardMaterial({ color: colour, roughness: 0.75 }));
       body.castShadow = body.receiveShadow = true;
-      Object.assign(body.userData, { block: number, colour: mesh.colour });
-      const lines = new three.LineSegments(mesh.edges, new three.LineBasicMaterial({ color: 0x2c303a }));
-      const group = new three.Group();
-      group.add(body, lines);
+      const lines = new three.LineSegments(edges, LINES);
+      const group = new three.Group().add(body, lines);
       this.table.add(group);
-      return group;
+      return { group, body, lines, colour };
     });
   }
 
   /** Moves the blocks. */
   pose(poses: Pose[]): void {
     this.poses = poses;
-    const middle = new three.Vector3();
-    for (const pose of poses) middle.add(new three.Vector3(pose[0], pose[1], pose[2]));
-    middle.divideScalar(Math.max(1, poses.length)).setZ(0);
-    this.blocks.forEach((block, i) => {
+    const mean = (axis: 0 | 1) => poses.reduce((sum, pose) => sum + pose[axis], 0) / Math.max(1, poses.length);
+    const [x, y, further] = [mean(0), mean(1), this.explosion];
+    this.blocks.forEach(({ group }, i) => {
       const pose = poses[i];
       if (!pose) return;
-      block.position.set(pose[0], pose[1], pose[2]);
-      block.position.add(block.position.clone().sub(middle).multiplyScalar(this.explosion));
-      block.quaternion.set(pose[3], pose[4], pose[5], pose[6]);
+      group.position.set(pose[0] + (pose[0] - x) * further, pose[1] + (pose[1] - y) * further, pose[2] * (1 + further));
+      group.quaternion.set(pose[3], pose[4], pose[5], pose[6]);
     });
     this.paint();
   }
@@ -98,13 +102,11 @@ export class World {
 
   /** Paints some blocks red, and makes others see-through. */
   mark(red: number[], faint: (block: number) => boolean = () => false): void {
-    this.blocks.forEach((block, i) => {
-      const body = block.children[0] as three.Mesh<three.BufferGeometry, three.MeshStandardMaterial>;
-      body.material.color.copy(red.includes(i) ? FALLEN : body.userData.colour);
+    this.blocks.forEach(({ body, lines, colour }, i) => {
+      body.material.color.copy(red.includes(i) ? FALLEN : colour);
       body.material.transparent = faint(i);
       body.material.opacity = faint(i) ? 0.12 : 1;
-      block.children[1]!.visible = !faint(i);
-      body.castShadow = !faint(i);
+      body.castShadow = lines.visible = !faint(i);
     });
     this.paint();
   }
@@ -185,8 +187,9 @@ export class World {
     const at = new three.Vector2(((event.clientX - box.left) / box.width) * 2 - 1, 1 - ((event.clientY - box.top) / box.height) * 2);
     const ray = new three.Raycaster();
     ray.setFromCamera(at, this.camera);
-    const hit = ray.intersectObjects(this.blocks.map((block) => block.children[0]!), false)[0];
-    if (hit) this.onPick(hit.object.userData.block);
+    const bodies: three.Object3D[] = this.blocks.map((block) => block.body);
+    const hit = ray.intersectObjects(bodies, false)[0];
+    if (hit) this.onPick(bodies.indexOf(hit.object));
   }
 
   private resize(): void {
@@ -199,13 +202,13 @@ export class World {
   }
 }
 
-function meshOf(shape: Shape): { body: three.BufferGeometry; edges: three.BufferGeometry; colour: three.Color } {
-  const body = new three.BufferGeometry();
-  body.setAttribute("position", new three.Float32BufferAttribute(shape.points.flat(), 3));
-  body.setAttribute("normal", new three.Float32BufferAttribute(shape.normals.flat(), 3));
-  body.setIndex(shape.triangles.flat());
+function meshOf(shape: Shape): { faces: three.BufferGeometry; edges: three.BufferGeometry; colour: three.Color } {
+  const faces = new three.BufferGeometry();
+  faces.setAttribute("position", new three.Float32BufferAttribute(shape.points.flat(), 3));
+  faces.setAttribute("normal", new three.Float32BufferAttribute(shape.normals.flat(), 3));
+  faces.setIndex(shape.triangles.flat());
   const edges = new three.BufferGeometry();
   edges.setAttribute("position", new three.Float32BufferAttribute(shape.edges.flatMap(([a, b]) => [...shape.points[a!]!, ...shape.points[b!]!]), 3));
   const [red, green, blue] = shape.colour;
-  return { body, edges, colour: new three.Color().setRGB(red, green, blue, three.SRGBColorSpace) };
+  return { faces, edges, colour: new three.Color().setRGB(red, green, blue, three.SRGBColorSpace) };
 }
