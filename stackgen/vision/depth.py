@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.vision.drawings import of_two_tones
-from stackgen.vision.images import Levels, Picture, Raster, as_bytes
+from stackgen.vision.images import Levels, Picture, Raster, as_bytes, of_two_tones
 from stackgen.vision.masks import bounding_box, components, largest, smoothed
 from stackgen.world import Mask
 

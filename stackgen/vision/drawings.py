@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stackgen.errors import StackgenError
-from stackgen.vision.images import SMALLEST, Image8
+from stackgen.vision.images import CONTRAST, SMALLEST, Image8, of_two_tones
 from stackgen.vision.masks import bounding_box, components
 from stackgen.world import Grid, Mask
 
@@ -25,9 +25,10 @@ WORK_SIZE = 768
 """Longer edge [pixel] every picture is brought to, so that edges are found to a fraction of a pixel."""
 
 _SPECK = 0.005  # parts, and holes, under this share of the largest part are dirt
-_CONTRAST = 20.0  # the least difference from the background that counts [of 255]
 _EDGE_BAND = 0.02  # width of the strip along the edge that shows the background [of the shorter edge]
 _BORDER = 0.03  # greatest width of a line along the picture's edge [of that edge]
+_SHADOW = 0.03  # least share of a picture that is a shadow,
+_IN_SHADOW = 0.15  # and by which ink is darker than it, by how much darker it is than the paper itself
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ def find_drawn(image: Image8, look: Look) -> Drawn:
     scale = WORK_SIZE / max(look.levels.shape)
     levels = _resized(look.levels, scale)
     difference = np.abs(levels - background).max(axis=2)
-    if np.count_nonzero(difference > _CONTRAST) < 0.001 * difference.size:
+    if np.count_nonzero(difference > CONTRAST) < 0.001 * difference.size:
         raise StackgenError("is all one colour, so nothing or everything is in it; draw a structure on a background")
     ink = _clean(_without_rim(difference > _threshold(difference[::2, ::2])))
     if ink.mean() > 0.98:
@@ -111,7 +112,7 @@ def _levels(image: Image8) -> tuple[Levels, tuple[int, int]]:
     inside = colours[rows, columns]
     if opaque[rows, columns].mean() > 0.97 and min(inside.shape[:2]) >= SMALLEST:
         seen = inside[opaque[rows, columns]]
-        if (np.quantile(seen, 0.995, axis=0) - np.quantile(seen, 0.005, axis=0)).max() > _CONTRAST:
+        if (np.quantile(seen, 0.995, axis=0) - np.quantile(seen, 0.005, axis=0)).max() > CONTRAST:
             inside = np.where(opaque[rows, columns, None], inside, np.median(seen, axis=0)).astype(np.uint8)
             return inside, (columns.start, rows.start)
     return image.alpha[..., None], (0, 0)
@@ -133,7 +134,9 @@ def _framed(levels: Levels, place: tuple[int, int]) -> tuple[Levels, tuple[int, 
             break
         top, right, bottom, left = top + widths[0], right - widths[1], bottom - widths[2], left + widths[3]
     rest = levels[top:bottom, left:right]
-    if (np.quantile(rest, 0.995) - np.quantile(rest, 0.005)) < _CONTRAST and rest.mean() < levels[0].mean() - _CONTRAST:
+    if rest.shape == levels.shape:
+        return levels, place
+    if np.ptp(np.quantile(rest, (0.005, 0.995))) < CONTRAST and rest.mean() < levels[0].mean() - CONTRAST:
         return levels, place  # no border, but a dark structure with little paper around it
     return rest, (place[0] + left, place[1] + top)
 
@@ -143,12 +146,12 @@ def _border(levels: Levels, ground: NDArray[np.floating]) -> int:
     most = max(1, round(_BORDER * len(levels)))
     if len(levels) < 4 * most:
         return 0
-    if np.abs(np.median(levels[0], axis=0) - ground).max() <= _CONTRAST:
+    if np.abs(np.median(levels[0], axis=0) - ground).max() <= CONTRAST:
         return 0
     rows = levels[: 2 * most + 2]
     tones = np.median(rows, axis=1)
-    even = (np.abs(rows - tones[:, None]).max(axis=2) < 2 * _CONTRAST).mean(axis=1) > 0.9  # palettes are dithered
-    unlike = np.abs(tones - ground).max(axis=1) > _CONTRAST
+    even = (np.abs(rows - tones[:, None]).max(axis=2) < 2 * CONTRAST).mean(axis=1) > 0.9  # palettes are dithered
+    unlike = np.abs(tones - ground).max(axis=1) > CONTRAST
     line = even & unlike
     if not line[0] or line.all():
         return 0
@@ -179,10 +182,10 @@ def _background(levels: Levels) -> tuple[NDArray[np.float32], tuple[str, ...]]:
     background = np.median(border, axis=0)
     notes: tuple[str, ...] = ()
     around = np.concatenate([edge.reshape(-1, levels.shape[2]) for edge in edges])
-    other = around[np.abs(around - background).max(axis=1) > 3 * _CONTRAST]
+    other = around[np.abs(around - background).max(axis=1) > 3 * CONTRAST]
     if levels.shape[2] == 3 and len(other) > 0.02 * len(around):
         tone = np.median(other, axis=0)
-        if tone.min() > 165 and background.mean() < 150 and (np.abs(other - tone).max(axis=1) < _CONTRAST).mean() > 0.6:
+        if tone.min() > 165 and background.mean() < 150 and (np.abs(other - tone).max(axis=1) < CONTRAST).mean() > 0.6:
             background = tone
             notes = ("The picture is cut off along its edges; what is dark in it was taken for the structure.",)
     return background.astype(np.float32), notes
@@ -207,7 +210,7 @@ def _threshold(difference: Differences) -> float:
         at_edge = np.unique(np.concatenate([labels[0], labels[:, 0], labels[:, -1]]))
         inside = np.isin(labels, at_edge, invert=True)
         enough = max(2 * _SPECK * np.count_nonzero(difference > threshold), 1)
-        if lower < _CONTRAST / 2 or count < 2 or np.count_nonzero(inside) < enough:
+        if lower < CONTRAST / 2 or count < 2 or np.count_nonzero(inside) < enough:
             return threshold
         if np.count_nonzero(in_between) > 0.3 * np.count_nonzero(paler):
             return threshold
@@ -354,29 +357,31 @@ def look_at(image: Image8) -> Look:
     tone = np.median(np.concatenate(edges), axis=0)
     step = max(1, max(levels.shape) // (WORK_SIZE // 2))
     some = np.moveaxis(levels[::step, ::step], 2, 0)
+    two_tone = any(of_two_tones(end.reduce(some)) for end in (np.maximum, np.minimum))
     return Look(
         levels,
         place,
         flat=float(np.count_nonzero(same)) > 0.8 * same.size,
-        two_tone=any(of_two_tones(end.reduce(some)) for end in (np.maximum, np.minimum)),
+        two_tone=two_tone and not _is_shaded(some.min(axis=0)),
         even=_is_even(levels),
         on_white=bool(tone.min() > 140 and np.ptp(tone) < 40),
     )
 
 
-def of_two_tones(values: NDArray[np.uint8]) -> bool:
-    """Tell whether levels (H, W) lie near to two of them, far apart."""
+def _is_shaded(values: NDArray[np.uint8]) -> bool:
+    """Tell whether there are strokes in what is dark of levels (H, W), as in the shadow that falls over a sketch."""
     import cv2
 
+    values = np.asarray(cv2.medianBlur(values, 5), np.uint8)
     split, _ = cv2.threshold(values, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    low, high = values[values <= split], values[values > split]
-    if not low.size or not high.size:
-        return True
-    ends = np.median(low), np.median(high)
-    apart = float(ends[1] - ends[0])
-    beside = max(float(np.abs(low - ends[0]).mean()), float(np.abs(high - ends[1]).mean()))
-    beyond = (values < ends[0] - 0.35 * apart) | (values > ends[1] + 0.35 * apart)  # ink in a shadow is darker still
-    return bool(apart > _CONTRAST and beside < 0.085 * apart + 2 and beyond.mean() < 0.003)
+    dark = values <= split
+    wide = cv2.morphologyEx(dark.astype(np.uint8), cv2.MORPH_OPEN, np.ones((15, 15), np.uint8))
+    inner = cv2.erode(wide, np.ones((9, 9), np.uint8)) > 0
+    if inner.mean() < _SHADOW or dark.all():
+        return False
+    strokes = cv2.morphologyEx(values, cv2.MORPH_BLACKHAT, np.ones((11, 11), np.uint8))
+    apart = float(np.median(values[~dark])) - float(np.median(values[dark]))
+    return bool((strokes[inner] > _IN_SHADOW * apart).mean() > 0.01)
 
 
 def _is_even(levels: Levels) -> bool:
@@ -388,5 +393,5 @@ def _is_even(levels: Levels) -> bool:
         for patch in np.array_split(edge, 8, axis=1)
     ]
     tones = np.array(places)
-    alike = np.abs(tones[:, None] - tones[None]).max(axis=2) < 0.6 * _CONTRAST
+    alike = np.abs(tones[:, None] - tones[None]).max(axis=2) < 0.6 * CONTRAST
     return bool(alike.mean(axis=1).max() > 0.7)

@@ -32,6 +32,9 @@ LARGEST = 1200
 SMALLEST = 8
 """Least edge of a picture, and of the structure in it [pixel]."""
 
+CONTRAST = 20.0
+"""Least difference between the tones of a drawing that counts [of 255]."""
+
 _LARGE = 400  # dots of a palette in larger pictures may be two pixels apart
 
 _MOST_PIXELS = 90_000_000
@@ -233,3 +236,21 @@ def as_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
     """Stretch finite values (H, W) over 0..255."""
     low, spread = float(values.min()), float(np.ptp(values))
     return np.asarray(np.round((values.astype(np.float64) - low) * (255 / spread if spread else 0)), np.uint8)
+
+
+def of_two_tones(values: NDArray[np.uint8]) -> bool:
+    """Tell whether levels (H, W) lie near to two of them, far apart; the edges between both may be soft."""
+    import cv2
+
+    _, high = cv2.threshold(values, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    if high.min() == high.max():
+        return True
+    ends, off = [], []
+    for tone in (cv2.bitwise_not(high), high):
+        core = cv2.erode(tone, np.ones((3, 3), np.uint8))
+        within = values[(core if core.any() else tone) > 0]
+        ends.append(float(np.median(within)))
+        off.append(float(np.abs(within - ends[-1]).mean()))
+    apart, beside = ends[1] - ends[0], max(off)
+    beyond = (values < ends[0] - 0.35 * apart) | (values > ends[1] + 0.35 * apart)  # ink in a shadow is darker still
+    return bool(apart > CONTRAST and beside < 0.085 * apart + 2 and beyond.mean() < 0.003)

@@ -34,8 +34,8 @@ def components(mask: Mask, connectivity: int = 8) -> tuple[NDArray[np.int32], ND
     """
     import cv2
 
-    _, labels, parts, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8), connectivity=connectivity)
-    areas = parts[:, cv2.CC_STAT_AREA].copy()
+    _, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=connectivity)
+    areas = np.bincount(labels.ravel())  # faster than OpenCV's statistics
     areas[0] = 0
     return np.asarray(labels, np.int32), np.asarray(areas, np.int32)
 

@@ -162,14 +162,17 @@ def read_picture(
         image = raster if isinstance(raster, Image8) else images.as_picture(raster)
         look = drawings.look_at(image)
         drawn = image.alpha is not None or look.sheetless or min(image.colours.shape[:2]) < LEAST_PHOTO
-        sheet = None if as_ == "drawing" or drawn else find_sheet(image.colours)
+        seen = sheet = None if as_ == "drawing" or drawn else find_sheet(image.colours)
         if sheet is not None and (look.two_tone or sheet.seen < 4):
-            clear = sheet.sureness > _CLEAR or not look.two_tone  # a structure that is light has gaps
+            clear = (sheet.sureness > _CLEAR and sheet.seen > 2) or not look.two_tone  # a light structure has gaps
             if not clear or not is_drawn_on(image.colours, sheet):
                 sheet = None  # the ground between two strokes, or within a doorway, is no sheet
         if as_ == "photo" or (as_ is None and not drawn and (sheet is not None or not look.drawn)):
             return _of_photo(image, sheet, which, look.even, insisted=as_ is not None)
-        return _of_drawing(image, grid, which, look, insisted=as_ is not None)
+        reading = _of_drawing(image, grid, which, look, insisted=as_ is not None)
+        if reading is None and seen is None:
+            raise StackgenError(_UNCLEAR)
+        return reading or _of_photo(image, seen, which, look.even, insisted=False)
     except StackgenError as error:
         raise StackgenError(f"{images.name_of(source)}: {error}") from error
 
@@ -204,13 +207,13 @@ def read_colours(path: str | Path) -> Picture:
         raise StackgenError(f"{path}: {error}") from error
 
 
-def _of_drawing(image: Image8, grid: Grid, which: int | None, look: Look, insisted: bool) -> Reading:
-    """Read a drawing on an even ground; what is not flat may be a photo, at whose edges a table shows."""
+def _of_drawing(image: Image8, grid: Grid, which: int | None, look: Look, insisted: bool) -> Reading | None:
+    """Read a drawing on an even ground; None where what is found in it is a sheet that is drawn on itself."""
     drawn = drawings.find_drawn(image, look)
     ink, _ = without_rules(drawn.ink, drawn.darkness)
     found = choose(ink, which, spread=True, framed=not look.flat)
     if not insisted and not found.stroke and drawn.drawn_on(found.mask):
-        raise StackgenError(_UNCLEAR)
+        return None
     notes = drawn.notes
     if found.mask.mean() > _FULL and found.mask[bounding_box(found.mask)].shape == found.mask.shape:
         notes = (

@@ -30,6 +30,7 @@ _ALIKE = 0.02  # and where no more of its strokes enclose nothing than with it, 
 _EDGE = 0.02  # what is nearer to the sheet's edge runs off it, by its longer edge
 _APART = 0.03  # what is further from its largest part is beside it, half of that where it is solid, by its size
 _LEVEL = 0.06  # feet of one structure are level to within this, by its size
+_FOOT = 0.08  # what is this much above its lowest point stands on the ground, by its size
 
 
 def choose(
@@ -137,11 +138,20 @@ def _one(group: Mask) -> Filled | StackgenError:
         sure = [filled for filled in bodies if filled.sureness > _SURE * surest]
         left = [loose(inks[0], filled.mask, filled.stroke) for filled in sure]
         chosen = next(filled for filled, of in zip(sure, left, strict=True) if of <= min(left) + _ALIKE)
-        return replace(chosen, notes=(*chosen.notes, "The ground line was left out."))
+        notes = (*chosen.notes, "The ground line was left out.")
+        if chosen is not bodies[0] and _is_between(inks[-1], chosen.mask):
+            notes = (*notes, "Whether there is a gap between two blocks on the ground line is uncertain.")
+        return replace(chosen, notes=notes)
     try:
         return fill(group)
     except StackgenError as error:
         return error
+
+
+def _is_between(ink: Mask, mask: Mask) -> bool:
+    """Tell whether there is a face between two others at the foot of what was filled (H, W), by its strokes."""
+    foot = (ink & mask)[bounding_box(mask)[0].stop - 1 - round(_FOOT * extent(mask))]
+    return bool(np.count_nonzero(np.diff(foot.astype(np.int8), prepend=0) > 0) > 3)
 
 
 def _filled(ink: Mask) -> Filled | None:

@@ -13,7 +13,8 @@ from stackgen.vision.masks import bounding_box, extent, largest
 from stackgen.world import Mask
 
 _NEAR = 0.06  # the line's two ends are level to within this, by the size of all the ink
-_EXPLAINED = 0.75  # least share of the ink that is the ground line or stands on it
+_EXPLAINED = 0.75  # least share of the ink that is the ground line or stands on it,
+_BELOW = 0.06  # and greatest share of what lies below
 
 
 def without_ground(ink: Mask) -> list[Mask]:
@@ -57,9 +58,12 @@ def _off_ground(ink: Mask) -> tuple[Mask, tuple[slice, slice] | None]:
 
 def _is_all(ink: Mask, body: Mask, path: NDArray[np.int64], width: float) -> bool:
     """Tell whether a body and the line along a path (W,) are nearly all of the ink: no blocks lie below the ground."""
-    off = np.abs(np.arange(len(ink))[:, None] - path)
-    line = ink & (path >= 0) & (off <= 2 * width)
-    return bool(np.count_nonzero(body | line) > _EXPLAINED * np.count_nonzero(ink))
+    off = np.arange(len(ink))[:, None] - path
+    along = ink & (path >= 0)
+    stands = np.count_nonzero(body | (along & (np.abs(off) <= 2 * width)))
+    below = np.count_nonzero(along & (off > 2 * width))
+    whole = np.count_nonzero(ink)
+    return bool(stands > _EXPLAINED * whole and below < _BELOW * whole)
 
 
 def _only(mask: Mask, box: tuple[slice, slice]) -> Mask:
@@ -73,13 +77,14 @@ def _erased_along(ink: Mask, path: NDArray[np.int64], width: float) -> Mask:
     """Erase a line of some width along its row in each column (W,), and what is below it; what stands on it stays."""
     body = ink.copy()
     reach = max(2, round(0.75 * width))
-    alone = np.zeros(len(path), dtype=bool)
+    thick = np.zeros((1, len(path)), dtype=np.uint8)
     for column in np.flatnonzero(path >= 0):
-        top, bottom = max(0, path[column] - reach), min(len(ink), path[column] + reach + 1)
-        run = np.flatnonzero(ink[max(0, top - reach) : bottom + reach, column])
-        alone[column] = np.ptp(run) <= 1.35 * width if run.size else True
-        if alone[column]:
-            body[top:bottom, column] = False
+        run = np.flatnonzero(ink[max(0, path[column] - 2 * reach) : path[column] + 2 * reach + 1, column])
+        thick[0, column] = min(int(np.ptp(run)), 255) if run.size else 0
+    smooth = cv2.medianBlur(thick, 4 * reach + 1)[0]  # a pen leaves holes in both lines, and strays
+    alone = (smooth <= 1.35 * width) & (path >= 0)
+    for column in np.flatnonzero(alone):
+        body[max(0, path[column] - reach) : path[column] + reach + 1, column] = False
     free = np.flatnonzero(alone)
     for column in np.flatnonzero((path >= 0) & ~alone) if free.size else ():
         body[round(float(np.interp(column, free, path[free]))) :, column] = False
