@@ -76,7 +76,7 @@ async function begin(): Promise<void> {
   byId("studio").hidden = false; // all of it at once, so that nothing jumps
   themes(() => {
     pad.paint();
-    panes.forEach((pane) => pane.stage.world.colour());
+    panes.forEach((pane) => pane.colour());
   });
   panes[1]!.element.hidden = true;
   panes[0]!.stage.say("draw, then press Generate");

@@ -37,6 +37,7 @@ PUSHED = 0.5
 """How fast a push grows [weight of the block/s]."""
 
 _GONE = 0.1  # distance from its start at which a block has left its place [cell]
+_FAR = 4.0  # distance from its start from which nobody looks after it [cell]
 _STILL = 0.1  # speed below which it has not begun to move [cell/s]
 _MOST_STACKS = 100  # of a file that is sent
 
@@ -116,21 +117,21 @@ def first_to_go(rollout: Rollout, verdict: Verdict) -> int | None:
     """Find the block of those that fell which left its place first; None where none fell."""
     if verdict.stable:
         return None
-    return int(np.where(verdict.fell, _left(rollout), np.inf).argmin())
+    return int(np.where(verdict.fell, _left(rollout, _GONE), np.inf).argmin())
 
 
-def _left(rollout: Rollout) -> NDArray[np.int64]:
-    """Find the frame (k,) in which each block has left its place, or the number of frames."""
+def _left(rollout: Rollout, distance: float) -> NDArray[np.int64]:
+    """Find the frame (k,) in which each block is this far from where it was, or the number of frames."""
     assert rollout.trajectory is not None
     path = rollout.trajectory[..., :3]
-    gone = np.linalg.norm(path - path[0], axis=-1) > _GONE
+    gone = np.linalg.norm(path - path[0], axis=-1) > distance
     return np.where(gone.any(axis=0), gone.argmax(axis=0), len(path))
 
 
 def _held_until(rollout: Rollout, block: int) -> int:
     """Find the last frame in which a block that fell had not begun to move."""
     assert rollout.trajectory is not None
-    path = rollout.trajectory[: _left(rollout)[block] + 1, block, :3]
+    path = rollout.trajectory[: _left(rollout, _GONE)[block] + 1, block, :3]
     still = np.linalg.norm(np.diff(path, axis=0), axis=-1) * FRAMES < _STILL
     return int(np.flatnonzero(still).max(initial=-1)) + 1
 
@@ -232,9 +233,10 @@ def _disturbed(
     if not verdict.stable:
         first, frame = first_to_go(rollout, verdict) or 0, rate * recorder.every * physics.step
         fell_at = round(min(most, frame * _held_until(rollout, first)), 2)
-        left = int(_left(rollout)[first])
+        left = int(_left(rollout, _GONE)[first])
         reached = min(most, frame * left)  # the hand that sees it go stops there
-        rollout, seen = up_to(reached, until_fall=False), left + FRAMES  # later, all may have slid off the table
+        rollout = up_to(reached, until_fall=False)
+        seen = min(left + FRAMES, int(_left(rollout, _FAR).min()))  # later, all may have slid off the table
     facts = {**rollout_facts(rollout, physics), "reached": reached, "growth": rate, "fell_at": fell_at}
     send({"shapes": entry.stack.shapes.tolist(), **facts, "frames": facts["frames"][:seen]})
 

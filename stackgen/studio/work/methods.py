@@ -14,8 +14,8 @@ BEST = "best"
 """Search and network together, as `stackgen sample` asks them."""
 
 _TITLES = {
-    "taught-verdicts": "StackGen: diffusion, taught by the search",
-    "ddpm-verdicts": "StackGen: diffusion",
+    "taught-verdicts": "Diffusion, taught by the search",
+    "ddpm-verdicts": "Diffusion, with verdicts",
     "ddpm-small": "Diffusion, without verdicts",
     "ddpm-paper-small": "Diffusion, the paper's recipe",
     "tran-reg": "Tran-Reg: regression",

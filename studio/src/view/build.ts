@@ -152,7 +152,7 @@ export class Building {
       await played;
       if (running.signal.aborted) return;
       stage.say(last ? "built, and stands" : "does not stand", last ? "stands" : "falls");
-      this.stop.textContent = "Take the arm away";
+      this.stop.textContent = "Remove arm";
       this.element.dataset.built = "";
     } catch (error) {
       if (running.signal.aborted && isAbort(error)) return;

@@ -136,7 +136,7 @@ export class Disturbances {
     const center = this.stack!.statics.centers[block]!;
     const push = (amount: number, moved: number[]) => this.stage.setMarks(arrow(center.map((x, i) => x + moved[i]!), direction, amount));
     await this.ask("push", this.pushed, { block, force, direction }, push, (at, stands) => {
-      const limit = `statics gives ${(this.stack!.statics.push ?? 0).toFixed(2)} for the weakest block in its worst direction`;
+      const limit = `statics gives ${(this.stack!.statics.push ?? 0).toFixed(2)} for the weakest block and direction`;
       const times = `${at.toFixed(2)} times its weight`;
       return [`${at.toFixed(2)} × weight`, stands ? `It stands when block ${block + 1} is pushed with ${times}; ${limit}.` : `It falls when block ${block + 1} is pushed with ${times}; ${limit}.`];
     }, block);

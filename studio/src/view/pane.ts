@@ -20,7 +20,7 @@ const NOISE_RATE = 14; // frames of denoising in a second
 export class Pane {
   readonly element: HTMLElement;
   readonly stage: Stage;
-  private readonly title = el("h3");
+  private readonly title = el("h3", {}, "Structures");
   private readonly state = el("p", { class: "state", role: "status" });
   private readonly tabs = el("div", { class: "tabs", role: "group", "aria-label": "Structures" });
   private readonly facts = el("div", { class: "facts" });
@@ -125,6 +125,12 @@ export class Pane {
     this.choose(0);
   }
 
+  /** Takes the colours of the page. */
+  colour(): void {
+    this.stage.world.colour();
+    this.tell();
+  }
+
   private use(shapes: Shape[]): void {
     if (shapes === this.shapes) return;
     this.shapes = shapes;
@@ -176,17 +182,25 @@ export class Pane {
     this.shown = number;
     [...this.tabs.children].forEach((tab, i) => tab.setAttribute("aria-pressed", String(i === number)));
     const stack = this.stacks[number]!;
-    const size = this.file.file.grid.image_size;
-    this.facts.replaceChildren(
-      ...this.file.notes.map((note) => el("p", { class: "note" }, note)),
-      el("div", { class: "columns" }, why(stack, this.shapes), ...(stack.views ? [overlays(stack.views, size)] : [])),
-    );
+    this.tell();
     this.share.replaceChildren(downloads(this.file, number, this.stage.world));
     this.building.take(this.file.file, number, stack);
     this.disturbances.take(this.file.file, number, stack, this.shapes.map((shape) => shape.name));
     this.tools.inert = false;
     this.stage.present(stack.shapes, stack.frames[0]!);
     void this.drop();
+  }
+
+  /** Says how the stack fared, and shows its silhouettes. */
+  private tell(): void {
+    const stack = this.stacks[this.shown];
+    if (!stack || !this.file) return;
+    const { file, notes } = this.file;
+    const views = stack.views ? [overlays(stack.views, file.grid.image_size)] : [];
+    this.facts.replaceChildren(
+      ...notes.map((note) => el("p", { class: "note" }, note)),
+      el("div", { class: "columns" }, why(stack, this.shapes), ...views),
+    );
   }
 
   /** Switches gravity on; what falls is explained a moment later. */

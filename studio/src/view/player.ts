@@ -16,7 +16,7 @@ export class Player {
   constructor(
     private readonly show: (poses: Pose[]) => void,
     private readonly awake: () => void,
-    private readonly moved: (player: Player) => void = () => {},
+    private readonly moved: () => void,
   ) {}
 
   /** Plays a clip from its beginning; the promise says that it was played, or that somebody chose another moment. */
@@ -66,7 +66,7 @@ export class Player {
     if (this.time < this.duration) return true;
     if (!this.waiting) {
       this.playing = false;
-      this.moved(this);
+      this.moved();
       this.ended();
     }
     return false;
@@ -74,13 +74,13 @@ export class Player {
 
   private draw(): void {
     const { frames, rate } = this.clip;
-    if (!frames.length) return;
+    if (!frames.length) return this.moved();
     const place = Math.min(frames.length - 1, this.time * rate);
     const [from, to] = [frames[Math.floor(place)]!, frames[Math.ceil(place)]!];
     this.show(from === to ? from : from.map((pose, i) => (pose === to[i] ? pose : between(pose, to[i]!, place % 1))));
     const [before, after] = [this.clip.joints?.[Math.floor(place)], this.clip.joints?.[Math.ceil(place)]];
     if (before && after) this.pose(before.map((angle, i) => angle + (after[i]! - angle) * (place % 1)));
-    this.moved(this);
+    this.moved();
   }
 }
 

@@ -6,7 +6,7 @@ import type { Clip, Pose, Shape } from "../types";
 import { Player } from "./player";
 import { World } from "./world";
 
-const SLOT = 5.5; // distance of stacks side by side [cell]
+const SLOT = 4.5; // distance of stacks side by side [cell]
 const FARTHEST = 9; // from the middle at which blocks are still looked at: the edge of the table [cell]
 
 export type Tone = "" | "stands" | "falls" | "busy";
@@ -25,7 +25,8 @@ export class Stage {
   readonly player: Player;
   private readonly badge = el("p", { class: "badge", role: "status" });
   private readonly seekBar = el("input", { type: "range", min: 0, max: 1, step: 0.001, value: 0, "aria-label": "Moment" });
-  private readonly playButton = button("Play", () => this.player.toggle(), { disabled: true });
+  private readonly playButton = button("Play", () => this.player.toggle());
+  private readonly bar = el("div", { class: "play", hidden: true }, this.playButton, this.seekBar);
   onMoment: (time: number) => void = () => {}; // of the clip [s]
   private marks: three.Object3D | null = null;
   told: Told | null = null;
@@ -36,8 +37,7 @@ export class Stage {
     this.player = new Player((poses) => this.world.pose(poses), () => this.world.paint(), () => this.moved());
     this.world.onFrame = (seconds) => this.player.step(seconds);
     this.seekBar.addEventListener("input", () => this.player.seek(Number(this.seekBar.value) * this.player.duration));
-    const bar = el("div", { class: "play" }, this.playButton, this.seekBar);
-    this.element = el("div", { class: "stage" }, this.world.canvas, this.badge, bar);
+    this.element = el("div", { class: "stage" }, this.world.canvas, this.badge, this.bar);
   }
 
   /** Shows a word over the picture. */
@@ -52,7 +52,7 @@ export class Stage {
     const down = Math.ceil(number / across);
     this.still();
     this.world.setBlocks(Array.from({ length: number }, () => shapes).flat());
-    this.world.home(across * SLOT * 0.95, 4 + down);
+    this.world.home(across * SLOT * 0.9, 4 + down);
     const place = (i: number) => [((i % across) - (across - 1) / 2) * SLOT, (Math.floor(i / across) - (down - 1) / 2) * SLOT] as const;
     return (stacks) =>
       stacks.flatMap((poses, i) => poses.map(([x, y, z, ...turn]): Pose => [x + place(i)[0], y + place(i)[1], z, ...turn]));
@@ -61,8 +61,8 @@ export class Stage {
   /** Shows one stack. */
   present(shapes: number[], poses: Pose[]): void {
     this.world.setBlocks(shapes);
-    this.still();
     this.player.clip = { frames: [], rate: 1 };
+    this.still();
     const extent = (axis: number) => Math.max(...poses.map((pose) => Math.abs(pose[axis]!)), 1) + 1;
     this.world.home(2 * extent(0), extent(2));
     this.world.pose(poses);
@@ -106,7 +106,7 @@ export class Stage {
   private moved(): void {
     const { time, duration, playing } = this.player;
     this.seekBar.value = String(duration ? time / duration : 0);
-    this.playButton.disabled = !duration;
+    this.bar.hidden = !duration;
     this.playButton.textContent = playing ? "Pause" : "Play";
     this.onMoment(time);
     if (!this.told) return;

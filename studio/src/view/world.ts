@@ -124,7 +124,7 @@ export class World {
     const size = Math.max(width, height, 2);
     this.controls.target.set(0, 0, height * 0.45);
     const aspect = Math.min(1, this.camera.aspect);
-    this.camera.position.set(0.75, -2.0, 0.75).multiplyScalar((size * 1.2) / Math.sqrt(aspect)).add(this.controls.target);
+    this.camera.position.set(0.75, -2.0, 0.75).multiplyScalar((size * 1.05) / Math.sqrt(aspect)).add(this.controls.target);
     this.controls.update();
     this.paint();
   }
