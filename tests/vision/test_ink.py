@@ -141,6 +141,19 @@ def test_the_top_of_a_block_that_sticks_out_is_no_ground_line() -> None:
     assert iou(choose(ink).mask, solid(base, top)) > 0.95
 
 
+def test_a_line_that_blocks_lie_below_is_no_ground_line() -> None:
+    wall = solid(box(150, 150, 400, 400))
+    ink = wall.copy()
+    ink[330:334, 40:150] = True  # a line of the paper, beside it
+    assert iou(choose(ink).mask, wall) > 0.97
+
+
+def test_what_the_ground_line_may_close_between_blocks_is_doubted() -> None:
+    ink = drawn(box(100, 200, 400, 300), box(100, 300, 200, 400), box(300, 300, 400, 400))
+    ink[398:403, 20:560] = True
+    assert "uncertain" in " ".join(choose(ink).notes)
+
+
 def test_a_drawing_that_runs_off_is_not_replaced_by_less_without_a_word() -> None:
     ink = drawn(np.array([[0, 100], [300, 100], [300, 400], [0, 400]]), box(420, 100, 500, 180))
     assert "uncertain" in " ".join(choose(ink).notes)

@@ -70,6 +70,15 @@ def test_what_is_left_out_is_told() -> None:
     assert any("left out" in note for note in reading.notes)
 
 
+def test_a_sketch_half_in_a_shadow_that_fills_the_photo_is_no_drawing_of_two_tones() -> None:
+    half = {"style": "outline", "zoom": 1.8, "slant": 0.05, "light": 0, "shadow": 0.6, "softness": 3, "grain": 1}
+    photo = Image.fromarray(photo_of(ARCH, **half, ink=(110, 110, 115), tone=(222, 215, 200), table=(165, 160, 150)))
+    buffer = io.BytesIO()
+    photo.save(buffer, "JPEG", quality=40)
+    reading = read_picture(Image.open(buffer), PAPER_GRID)
+    assert reading.kind == "photo" and overlap(reading, ARCH) >= 0.9
+
+
 def test_a_picture_may_be_insisted_to_be_a_photo_or_a_drawing() -> None:
     sheet = sheet_with(ARCH, Photo(style="outline"), cell=110)
     for kind in ("photo", "drawing"):
