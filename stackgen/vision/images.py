@@ -239,15 +239,18 @@ def as_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
 
 
 def of_two_tones(values: NDArray[np.uint8]) -> bool:
-    """Tell whether levels (H, W) lie near to two of them, far apart."""
+    """Tell whether levels (H, W) lie near to two of them, far apart; the edges between both may be soft."""
     import cv2
 
-    split, _ = cv2.threshold(values, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
-    low, high = values[values <= split], values[values > split]
-    if not low.size or not high.size:
+    _, high = cv2.threshold(values, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    if high.min() == high.max():
         return True
-    ends = np.median(low), np.median(high)
-    apart = float(ends[1] - ends[0])
-    beside = max(float(np.abs(low - ends[0]).mean()), float(np.abs(high - ends[1]).mean()))
+    ends, off = [], []
+    for tone in (cv2.bitwise_not(high), high):
+        core = cv2.erode(tone, np.ones((3, 3), np.uint8))
+        within = values[(core if core.any() else tone) > 0]
+        ends.append(float(np.median(within)))
+        off.append(float(np.abs(within - ends[-1]).mean()))
+    apart = ends[1] - ends[0]
     beyond = (values < ends[0] - 0.35 * apart) | (values > ends[1] + 0.35 * apart)  # ink in a shadow is darker still
-    return bool(apart > CONTRAST and beside < 0.085 * apart + 2 and beyond.mean() < 0.003)
+    return bool(apart > CONTRAST and max(off) < 0.04 * apart + 2 and beyond.mean() < 0.003)

@@ -44,6 +44,8 @@ _SHARP = 0.28  # by this logarithm
 
 _INK_TELLS = 0.3  # what ink tells of what is beside it, by what paper does: inks have many colours
 
+_ALIKE = 0.25  # share of its border from which on what is as light as paper beyond a stroke is paper, too
+
 _LEAST_REGION = 40  # what is smaller is part of a border [pixel at half the size]
 
 _COLOURED = 1.25  # largest by least channel of paper from which on it is coloured
@@ -149,11 +151,12 @@ def _solids(light: NDArray[np.uint8]) -> tuple[Mask, NDArray[np.float32]]:
         return np.zeros(light.shape, bool), np.zeros(light.shape, np.float32)
     nearest = _nearest(labels > 0)
     regions, here = labels.ravel()[nearest], levels.ravel()[nearest]
-    steps, lengths = _borders(regions, here, low, len(areas))
+    steps, lengths, alike = _borders(regions, here, low, len(areas))
     ends = np.concatenate([end.ravel() for end in (regions[:2], regions[-2:], regions[:, :2], regions[:, -2:])])
     runs_off = np.bincount(ends, minlength=len(areas)) > 0.2 * np.sqrt(areas)
     paper = runs_off & ((steps * lengths).sum(axis=1) >= np.log(_DARKER_THAN_SHADOW) * lengths.sum(axis=1))
     paper[areas.argmax()] = True
+    paper |= alike @ paper > _ALIKE
     ink = _darker(steps, lengths, paper)[regions]
     depth = np.where(ink, 1 - np.exp(here - here.ravel()[_nearest(~ink)]), 0)
     found = cv2.resize(np.stack([ink, depth], 2).astype(np.float32), light.shape[::-1])
@@ -172,7 +175,7 @@ def _nearest(mask: Mask) -> NDArray[np.int64]:
 
 def _borders(
     regions: NDArray[np.int32], levels: NDArray[np.float32], low: NDArray[np.float32], count: int
-) -> tuple[Floats, Floats]:
+) -> tuple[Floats, Floats, Floats]:
     """Compare regions that touch; those with a stroke between them do not.
 
     Args:
@@ -182,22 +185,25 @@ def _borders(
         count: Number of regions R.
 
     Returns:
-        (R, R) by how much one is lighter than another across their border, and (R, R) how long that is [pixel]; 0 to
-        one that has strokes around it nearly everywhere, as a face of an outline has.
+        (R, R) by how much one is lighter than another across their border; (R, R) how long that is [pixel], 0 to one
+        that has strokes around it nearly everywhere, as a face of an outline has; and (R, R) the share of its border
+        where one is as light as another beyond a stroke, as paper in one shadow is.
     """
-    steps, lengths, around = np.zeros(count * count), np.zeros(count * count), np.zeros(count)
+    steps, lengths, alike, around = *np.zeros((3, count * count)), np.zeros(count)
     for one, two in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
         for here, there in ((one, two), (two, one)):
             stroke = low[here] < np.minimum(levels[here], levels[there]) - _SHARP / 2
             differs = regions[here] != regions[there]
             around += np.bincount(regions[here][differs], minlength=count)
-            differs &= ~stroke
             pairs = regions[here][differs].astype(np.int64) * count + regions[there][differs]
-            steps += np.bincount(pairs, (levels[here] - levels[there])[differs], count * count)
-            lengths += np.bincount(pairs, minlength=count * count)
+            step, beyond = (levels[here] - levels[there])[differs], stroke[differs]
+            steps += np.bincount(pairs[~beyond], step[~beyond], count * count)
+            lengths += np.bincount(pairs[~beyond], minlength=count * count)
+            alike += np.bincount(pairs[beyond & (np.abs(step) < _SHARP / 2)], minlength=count * count)
     told = lengths.reshape(count, count)
     enough = told.sum(axis=1) >= around / 3
-    return (steps / np.maximum(lengths, 1)).reshape(count, count), told * enough[:, None]
+    share = alike.reshape(count, count) / np.maximum(around, 1)[:, None]
+    return (steps / np.maximum(lengths, 1)).reshape(count, count), told * enough[:, None], share
 
 
 def _darker(steps: Floats, lengths: Floats, paper: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -25,6 +25,8 @@ SHEETS = (0.707, 0.773)
 
 _BETWEEN = 0.755  # nearer to Letter, as most sheets are of A4
 
+_TELLS = 1e-3  # least product of how much further the far ends of both sides are with which they tell the focal length
+
 _HELD = np.radians([25.0, 8.0, 12.0])
 """How far a camera is usually turned about its axes to the right, down and ahead, before a sheet [rad]."""
 
@@ -76,7 +78,7 @@ def sheet_ratio(corners: Floats, edge: float) -> float:
     k3 = np.cross(one, four) @ two / (np.cross(three, four) @ two)
     across, down = k2 * two - one, k3 * three - one
     product = across[2] * down[2]
-    square = -(across[:2] @ down[:2]) / product if abs(product) > 1e-4 else 0.0
+    square = -(across[:2] @ down[:2]) / product if abs(product) > _TELLS else 0.0
     seen = np.clip(np.sqrt(square), *FOCALS) if square > 0 else FOCAL
     focal = np.sqrt(seen * FOCAL)  # corners tell it badly, and most cameras are alike
     lengths = [np.hypot(np.linalg.norm(vector[:2]) / focal, vector[2]) for vector in (across, down)]
