@@ -19,8 +19,9 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from http.client import HTTPConnection, HTTPResponse
 from importlib.util import find_spec
 from pathlib import Path
@@ -32,6 +33,7 @@ import numpy as np
 
 from benchmarks.common import ROOT, argument_parser, plain_table, report, start, summary
 from stackgen.studio.work.drawings import pack
+from stackgen.studio.work.methods import BEST
 
 LEANING = {
     "format": "stackgen.stacks/1",
@@ -131,17 +133,18 @@ def serving(command: list[str]) -> Iterator[str]:
         found = re.search(r"http://\S+/", server.stdout.readline())
         assert found
         address = urlsplit(found.group()).netloc
-        for _ in range(4):  # both processes are ready
-            ask(address, "POST", "/api/generate", wish())
+        for method in ("taught-verdicts", "taught-verdicts", "ddpm-verdicts", "ddpm-verdicts"):  # in both processes
+            ask(address, "POST", "/api/generate", wish(method=method))
         yield address
         server.terminate()
 
 
-def wish(seed: int = 0) -> dict[str, Any]:
-    """Ask for three verified stacks of the diffusion model, as the page does."""
+def wish(seed: int = 0, method: str = "taught-verdicts") -> dict[str, Any]:
+    """Ask for three verified stacks, as the page does."""
     arch = np.ones((56, 56), dtype=bool)
     arch[14:, 14:42] = False
-    wanted = {"method": "taught-verdicts", "sampler": {"kind": "dpm", "steps": 10}, "seed": seed}
+    sampler = {} if method == BEST else {"kind": "dpm", "steps": 10}
+    wanted = {"method": method, "sampler": sampler, "seed": seed}
     return {"drawing": {"cells": 4, "bits": pack(arch)}, "wish": wanted}
 
 
@@ -180,26 +183,19 @@ def first_frame(address: str) -> float:
         return seconds
 
 
-def three_stacks(address: str) -> float:
+def three_stacks(address: str, method: str) -> float:
     """Time three stacks, verified and explained [s]."""
     began = time.perf_counter()
-    status, content = ask(address, "POST", "/api/generate", wish(int(began * 1e6) % 1000))
+    status, content = ask(address, "POST", "/api/generate", wish(int(began * 1e6) % 1000, method))
     assert status == 200 and content.count(b'"kind": "stack"') == 3
     return time.perf_counter() - began
 
 
-def three_best(address: str) -> float:
-    """Time three stacks of search and network together [s]."""
-    began = time.perf_counter()
-    status, _ = ask(address, "POST", "/api/generate", {"drawing": wish()["drawing"]})
-    assert status == 200
-    return time.perf_counter() - began
-
-
-TIMED = {
+TIMED: dict[str, Callable[[str], float]] = {
     "the page, all of it": page,
-    "three verified stacks, diffusion": three_stacks,
-    "three stacks, search and network": three_best,
+    "three stacks, search and network": partial(three_stacks, method=BEST),
+    "three verified stacks, taught-verdicts": partial(three_stacks, method="taught-verdicts"),
+    "three verified stacks, ddpm-verdicts": partial(three_stacks, method="ddpm-verdicts"),
     "first frame of the noise": first_frame,
 }
 """What is timed."""

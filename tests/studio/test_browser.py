@@ -23,6 +23,9 @@ playwright = pytest.importorskip("playwright.sync_api", reason="drives the brows
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 PATIENCE = 300_000  # [ms]
 SIZES = {"desktop": (1500, 950), "tablet": (1000, 1200), "phone": (390, 844)}
+Rectangles = tuple[tuple[tuple[float, float], tuple[float, float]], ...]
+GATE: Rectangles = (((0.05, 0.3), (0.2, 0.95)), ((0.8, 0.3), (0.95, 0.95)), ((0.05, 0.05), (0.95, 0.2)))
+POST: Rectangles = (((0.3, 0.55), (0.45, 0.95)),)  # of two blocks, which are soon built
 OWN = ("data:", "blob:", "about:")
 GRAPHICS = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # without a graphics card
 SHIFTS = """
@@ -92,10 +95,10 @@ def drag(page: Any, start: tuple[float, float], end: tuple[float, float]) -> Non
     page.mouse.up()
 
 
-def draw_a_gate(page: Any) -> None:
+def draw(page: Any, rectangles: Rectangles) -> None:
     page.get_by_role("button", name="Clear").click()
     page.locator("#sketch").scroll_into_view_if_needed()
-    for start, end in (((0.05, 0.3), (0.2, 0.95)), ((0.8, 0.3), (0.95, 0.95)), ((0.05, 0.05), (0.95, 0.2))):
+    for start, end in rectangles:
         drag(page, start, end)
 
 
@@ -125,7 +128,7 @@ def generate(page: Any, compared: str = "") -> None:
 @pytest.mark.parametrize("page", SIZES, indirect=True)
 def test_what_is_drawn_is_compared_built_and_downloaded(page: Any) -> None:
     assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    draw_a_gate(page)
+    draw(page, POST)
     generate(page, "taught-verdicts")
     assert page.locator(".pane >> visible=true").count() == 2
     assert page.locator(".overlays canvas").count() == 6
@@ -140,7 +143,7 @@ def test_what_is_drawn_is_compared_built_and_downloaded(page: Any) -> None:
 
 
 def test_from_a_drawing_to_files_and_back(page: Any) -> None:
-    draw_a_gate(page)
+    draw(page, GATE)
     kept = drawn(page)
     page.get_by_role("button", name="Undo").click()
     assert drawn(page) != kept

@@ -60,7 +60,10 @@ export class Building {
 
   /** Stops a build, and takes the arm away. */
   reset(): void {
-    this.running?.abort();
+    if (this.running) {
+      this.running.abort();
+      this.stage.say(""); // a plan that failed says so beside it
+    }
     this.running = null;
     if (this.arm) {
       this.stage.world.table.remove(this.arm.object);
@@ -151,7 +154,9 @@ export class Building {
       this.status.textContent = stands;
       await played;
       if (running.signal.aborted) return;
-      stage.say(last ? "built, and stands" : "does not stand", last ? "stands" : "falls");
+      const [verdict, tone] = last ? (["built, and stands", "stands"] as const) : (["does not stand", "falls"] as const);
+      stage.onMoment = () => (stage.player.atEnd ? stage.say(verdict, tone) : stage.say("building", "busy"));
+      stage.onMoment(stage.player.time);
       this.stop.textContent = "Remove arm";
       this.element.dataset.built = "";
     } catch (error) {
