@@ -156,7 +156,8 @@ def _solids(light: NDArray[np.uint8]) -> tuple[Mask, NDArray[np.float32]]:
     runs_off = np.bincount(ends, minlength=len(areas)) > 0.2 * np.sqrt(areas)
     paper = runs_off & ((steps * lengths).sum(axis=1) >= np.log(_DARKER_THAN_SHADOW) * lengths.sum(axis=1))
     paper[areas.argmax()] = True
-    paper |= alike @ paper > _ALIKE
+    for _ in range(3):  # from what goes on to the edge, over the strokes of an outline, to what that stands around
+        paper |= alike @ paper > _ALIKE
     ink = _darker(steps, lengths, paper)[regions]
     depth = np.where(ink, 1 - np.exp(here - here.ravel()[_nearest(~ink)]), 0)
     found = cv2.resize(np.stack([ink, depth], 2).astype(np.float32), light.shape[::-1])

@@ -40,6 +40,8 @@ _BESIDE = 5  # how far from a side inside and outside are compared
 _BEYOND = 14  # so far from it, to one side, a mere line is as it is on the other
 _LEAST_SEEN = 15  # a side of which less is seen tells nothing
 _AT_EDGE = 4.0  # what is nearer to the photo's edge is cut off by it
+_COLOURED = 200.0  # tint of paper of which no table has the colour: beyond a side that has it is a shadow
+_SAME = 0.12  # logarithm by which the light of the three channels may change otherwise in it
 _LEVEL = 0.95  # light beyond a dark line by that before it
 
 _LARGE = 0.45  # exponent of its area: what a shadow divides off is smaller
@@ -205,7 +207,8 @@ def _steps(small: Picture, lines: Floats) -> tuple[Floats, Floats, Floats]:
         (2, N, T + 1) at how many places it does, with the paper on the one side and on the other; (2, N, T + 1) how
         deep, up to 1 each; and (N, T + 1) at how many both sides are seen: none of the last four, the photo's own.
     """
-    levels = [np.asarray(of, np.float32) for of in (least_channel(small), small.max(axis=2), _tint(small))]
+    middle = np.median(small, axis=2)
+    levels = [np.asarray(of, np.float32) for of in (least_channel(small), small.max(axis=2), _tint(small), middle)]
     size = np.array(small.shape[1::-1])
     points = lines[:, :1] + np.arange(-_REACH, _REACH)[:, None] * (lines[:, 1:] - lines[:, :1])
 
@@ -216,17 +219,19 @@ def _steps(small: Picture, lines: Floats) -> tuple[Floats, Floats, Floats]:
 
     counts, depths = [], []
     for side in (-1, 1):
-        (light, value, tint), here = beside(side * _BESIDE)
-        (dark, low, dull), there = beside(-side * _BESIDE)
-        (far, high, away), _ = beside(-side * _BEYOND)
-        (within, _, _), _ = beside(side * _BEYOND)
+        (light, value, tint, mean), here = beside(side * _BESIDE)
+        (dark, low, dull, grey), there = beside(-side * _BESIDE)
+        (far, high, away, _), _ = beside(-side * _BEYOND)
+        (within, *_), _ = beside(side * _BEYOND)
         known = here & there
         known[-4:] = False
-        darker = np.log(np.maximum((light + 8) / (dark + 8), (value + 8) / (low + 8)))
+        shares = [(one + 8) / (other + 8) for one, other in ((light, dark), (mean, grey), (value, low))]
+        darker = np.log(np.maximum(shares[0], shares[2]))
+        in_shadow = (tint < _COLOURED) & (np.ptp(np.log(shares), axis=0) < _SAME)
         down = np.maximum(darker / 0.13, (tint - dull) / 18)
         dark_line = (far > _LEVEL * light) & (high > _LEVEL * value) & (away > tint - 9)
         light_line = within + 8 < np.minimum(0.7 * (light + 8), 1.15 * (dark + 8))
-        down[dark_line | light_line | ~known] = 0
+        down[dark_line | light_line | in_shadow | ~known] = 0
         counts.append(_counted(down >= 1))
         depths.append(_counted(np.clip(down / 3, 0, 1)))
     return np.stack(counts), np.stack(depths), _counted(known)
