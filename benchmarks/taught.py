@@ -1,7 +1,8 @@
 """What teaching changes: samplers on validation scenes of both recipes, and on disturbed ones, never on testset-v1.
 
 Drawings and scenes of the paper's recipe are asked with their true block lists, disturbed scenes and the drawings of
-examples/silhouettes with the lists that the search finds, shifted to the grid's cells. The search itself is a row.
+examples/silhouettes with the lists that the search finds, or with those of a network (`--lists`), shifted to the grid's
+cells. The search itself is a row.
 """
 
 from __future__ import annotations
@@ -27,6 +28,9 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--drawings", default="data/drawings", help="dataset of drawings")
     options.add_argument("--paper", default="data/paper", help="dataset of the paper's recipe")
     options.add_argument("--kinds", nargs="*", choices=KINDS[1:], default=[], help="kinds of disturbed scenes")
+    options.add_argument(
+        "--lists", default="search", help="who gives the lists of disturbed scenes: `search` or weights"
+    )
     options.add_argument("--scenes", type=int, default=50, help="scenes of each set, evenly spread")
     options.add_argument("--disturbed", type=int, default=20, help="scenes of each kind of disturbance")
     options.add_argument("--num_samples", type=int, default=3, help="samples of each scene")
@@ -47,7 +51,7 @@ def main() -> None:
     from stackgen.sampling.methods import load_predictor, load_sampler
     from stackgen.sim.checkers import SimulatorChecker
 
-    checker, lists = SimulatorChecker(until_fall=True), AlignedPredictor(load_predictor("search"))
+    checker, lists = SimulatorChecker(until_fall=True), AlignedPredictor(load_predictor(options.lists))
     paper = load_scenes(options.paper, "validation")[0]
     sets = {
         DRAWN: spread(load_scenes(options.drawings, "validation")[0], options.scenes),
@@ -70,7 +74,12 @@ def main() -> None:
             rows.append({"scenes": kind, "number": len(scenes), "method": name}
                         | {metric: value and value.to_json() for metric, value in estimates.items()})  # fmt: skip
             print(kind, len(scenes), name, *(percent(rows[-1][metric]) for metric in METRICS), flush=True)
-    facts = {"samples_per_scene": options.num_samples, "seed": options.seed, "rows": rows}
+    facts = {
+        "samples_per_scene": options.num_samples,
+        "seed": options.seed,
+        "lists_of_disturbed": options.lists,
+        "rows": rows,
+    }
     lines = [
         [row["scenes"], str(row["number"]), row["method"], *(percent(row[metric]) for metric in METRICS)]
         for row in rows
