@@ -357,12 +357,12 @@ def look_at(image: Image8) -> Look:
     tone = np.median(np.concatenate(edges), axis=0)
     step = max(1, max(levels.shape) // (WORK_SIZE // 2))
     some = np.moveaxis(levels[::step, ::step], 2, 0)
-    two_tone = any(of_two_tones(end.reduce(some)) for end in (np.maximum, np.minimum))
+    shaded = _is_shaded(some.min(axis=0))  # by a camera, however even its noise was made
     return Look(
         levels,
         place,
-        flat=float(np.count_nonzero(same)) > 0.8 * same.size,
-        two_tone=two_tone and not _is_shaded(some.min(axis=0)),
+        flat=not shaded and float(np.count_nonzero(same)) > 0.8 * same.size,
+        two_tone=not shaded and any(of_two_tones(end.reduce(some)) for end in (np.maximum, np.minimum)),
         even=_is_even(levels),
         on_white=bool(tone.min() > 140 and np.ptp(tone) < 40),
     )
@@ -381,7 +381,7 @@ def _is_shaded(values: NDArray[np.uint8]) -> bool:
         return False
     strokes = cv2.morphologyEx(values, cv2.MORPH_BLACKHAT, np.ones((11, 11), np.uint8))
     apart = float(np.median(values[~dark])) - float(np.median(values[dark]))
-    return bool((strokes[inner] > _IN_SHADOW * apart).mean() > 0.01)
+    return bool((strokes[inner] > _IN_SHADOW * apart).mean() > 0.005)
 
 
 def _is_even(levels: Levels) -> bool:

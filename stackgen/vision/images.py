@@ -114,7 +114,9 @@ def _open(path: Path) -> Image:
                 image.load()
                 return _upright(image)
     except UnidentifiedImageError:
-        raise StackgenError("is not an image that can be read; give a PNG, JPEG, WebP, TIFF, GIF or BMP file") from None
+        raise StackgenError(
+            "is not an image that can be read, or is damaged; give a PNG, JPEG, WebP, TIFF, GIF or BMP file"
+        ) from None
     except Image.DecompressionBombError:
         raise StackgenError("has too many pixels to be read; scale it down first") from None
     except StackgenError:
@@ -253,4 +255,4 @@ def of_two_tones(values: NDArray[np.uint8]) -> bool:
         off.append(float(np.abs(within - ends[-1]).mean()))
     apart = ends[1] - ends[0]
     beyond = (values < ends[0] - 0.35 * apart) | (values > ends[1] + 0.35 * apart)  # ink in a shadow is darker still
-    return bool(apart > CONTRAST and max(off) < 0.04 * apart + 2 and beyond.mean() < 0.003)
+    return bool(apart > CONTRAST and max(off) < 0.065 * apart + 2 and beyond.mean() < 0.003)
