@@ -395,6 +395,6 @@ def shorten(message: str, limit: int = 300) -> str:
     """
     lines = [line.strip() for line in message.splitlines() if line.strip() and not _NOISE.match(line.strip())]
     text = " ".join(dict.fromkeys(line.removeprefix("- ") for line in lines))  # each member of a union says it
-    text = re.sub(r"""^Parser key ["'](.*?)["']""", r"\1", re.sub(r"<class '([\w.]+)'>", r"\1", text))
+    text = re.sub(r"""^Parser key ["'](.*?)_?["']""", r"\1", re.sub(r"<class '([\w.]+)'>", r"\1", text))
     text = re.sub(r"a typing\.Literal\[(.*?)\]", r"one of \1", text)
     return text if len(text) <= limit else f"{text[:limit].rstrip()} ..."

@@ -111,3 +111,8 @@ def test_a_saved_run_is_read_back_whatever_its_name_is() -> None:
 def test_a_value_that_is_none_is_one_line(value: str, cli: Cli) -> None:
     answer = cli("generate", "--name", "x", "--out", "x", "--seed", value)
     assert answer.code == 2 and "seed" in answer.line
+
+
+def test_an_option_is_named_as_it_is_typed(cli: Cli) -> None:
+    answer = cli("sample", "arch.png", "--as", "sketch")
+    assert answer.code == 2 and answer.err.startswith("stackgen sample: as: ") and "'photo'" in answer.err
