@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,22 +16,13 @@ import torch
 
 from stackgen.data.datamodule import StackDataModule
 from stackgen.data.dataset import Dataset
-from stackgen.data.loading import passes, streaming
+from stackgen.data.loading import streaming
 from stackgen.data.loading.streaming import ExactStream, TrainingStream
 from stackgen.data.shards import Sample, write_shard
 from stackgen.errors import StackgenError
+from tests.data.loading.batches import TRAIN, VALIDATION, place_of, templates
 
-TRAIN, VALIDATION = 71, 23  # samples of `dataset`
-
-
-def _place(rank: int, world: int = 3) -> tuple[int, int]:
-    return rank, world
-
-
-@pytest.fixture(autouse=True)
-def small_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A window to suit the data."""
-    monkeypatch.setattr(passes, "WINDOW", 16)
+pytestmark = pytest.mark.usefixtures("small_window")
 
 
 @contextmanager
@@ -44,10 +34,6 @@ def said() -> Iterator[list[str]]:
         yield lines
     lines += [str(w.message) for w in caught if str(w.message).startswith("data")]
     assert not any("\n" in line for line in lines)
-
-
-def templates(batches: Any) -> list[int]:
-    return [t for batch in batches for t in batch["template"].tolist()]
 
 
 def copy_of(dataset: Path, folder: Path, **shards: list[Sample]) -> Path:
@@ -164,7 +150,7 @@ def test_losses_leave_processes_with_equally_many_validation_batches(
         shares = [
             [
                 b["template"].tolist()
-                for b in ExactStream(Dataset.open(folder), "validation", batch_size, rank=partial(_place, rank))
+                for b in ExactStream(Dataset.open(folder), "validation", batch_size, rank=partial(place_of, rank))
             ]
             for rank in range(3)
         ]

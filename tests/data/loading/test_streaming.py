@@ -16,24 +16,10 @@ import torch
 from stackgen.data.arrays import StackArrays
 from stackgen.data.datamodule import StackDataModule
 from stackgen.data.dataset import Dataset
-from stackgen.data.loading import passes
 from stackgen.data.loading.streaming import ExactStream, TrainingStream
+from tests.data.loading.batches import TRAIN, place_of, templates
 
-TRAIN, VALIDATION = 71, 23  # samples of `dataset`
-
-
-def _place(rank: int, world: int = 3) -> tuple[int, int]:
-    return rank, world
-
-
-@pytest.fixture(autouse=True)
-def small_window(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A window to suit the data."""
-    monkeypatch.setattr(passes, "WINDOW", 16)
-
-
-def templates(batches: Any) -> list[int]:
-    return [t for batch in batches for t in batch["template"].tolist()]
+pytestmark = pytest.mark.usefixtures("small_window")
 
 
 @pytest.mark.parametrize("workers", [0, 2])
@@ -49,7 +35,7 @@ def test_an_exact_stream_is_the_split_in_memory(dataset: Path, splits: dict[str,
 @pytest.mark.parametrize("batch_size", [1, 4, 7, 50])
 def test_ranks_share_an_exact_stream(dataset: Path, splits: dict[str, StackArrays], batch_size: int) -> None:
     streams = [
-        ExactStream(Dataset.open(dataset), "validation", batch_size, rank=partial(_place, rank)) for rank in range(3)
+        ExactStream(Dataset.open(dataset), "validation", batch_size, rank=partial(place_of, rank)) for rank in range(3)
     ]
     cached = StackDataModule(dataset, batch_size=batch_size)
     shares = [[batch["template"].tolist() for batch in stream] for stream in streams]
@@ -70,7 +56,7 @@ def test_an_epoch_visits_everyone_at_most_once_and_leaves_out_less_than_a_step(
     seen, flips = Counter[int](), []
     for rank in range(world):
         stream = TrainingStream(
-            Dataset.open(dataset), batch_size, num_workers=workers, mirror=True, rank=partial(_place, rank, world)
+            Dataset.open(dataset), batch_size, num_workers=workers, mirror=True, rank=partial(place_of, rank, world)
         )
         batches = list(stream)
         assert len(batches) == len(stream) == TRAIN // (batch_size * world)
@@ -181,7 +167,7 @@ def test_on_another_number_of_processes_no_finished_window_is_read_again(
     state, seen, again = None, Counter[int](), 0
     for turn, world in enumerate(worlds):
         streams = [
-            TrainingStream(Dataset.open(dataset), 4, rank=partial(_place, rank, world), epoch=lambda: 2)
+            TrainingStream(Dataset.open(dataset), 4, rank=partial(place_of, rank, world), epoch=lambda: 2)
             for rank in range(world)
         ]
         for stream in streams:
