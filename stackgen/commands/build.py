@@ -46,6 +46,8 @@ class Wanted:
         from_image: Drawing, photo of a sketch, or depth frame (as for `stackgen capture`) to build instead of a file:
             the best of the verified stacks for it. The folder of --out then holds silhouette.png and overlay.png, too.
         inventory: With --from_image, blocks that are available, such as cube=4,rectangle=3.
+        cells: With --from_image, height of the structure in cells, such as 4, or width and height, such as 3x4; auto
+            finds it. Fewer cells are fewer blocks.
         weights: With --from_image, weights of the sampler: a name, .safetensors, .ckpt or run folder.
         budget: With --from_image, limit of the search for stacks: a time, such as 5s, or a number of stacks.
         seed: Seed of the noise, and with --from_image of the stacks.
@@ -58,6 +60,7 @@ class Wanted:
     stack: int = 1
     from_image: Path | None = None
     inventory: str | None = None
+    cells: str = "auto"
     weights: str = DEFAULT
     budget: str | None = None
     seed: int = 0
@@ -136,7 +139,7 @@ def main(
         return build_for_real(planned, real, wanted.out)
     result = _built(planned, wanted, simulation, content)
     _write(wanted, simulation, planned, content, result)
-    _show(result)
+    _show(result, wanted.from_image)
     written = [wanted.out, *([simulation.video] if simulation.video else [])]
     tell(f"wrote {' and '.join(map(str, written))}", wrote=written)
     return 0 if result.success else 1
@@ -163,8 +166,8 @@ def _from_file(file: Path | None, wanted: Wanted) -> StacksFile:
     """Read the file; its one stack is the one to build."""
     if file is None:
         raise StackgenError("give a stacks.json, or a picture with --from_image")
-    if wanted.inventory is not None or wanted.budget is not None:
-        raise StackgenError("--inventory and --budget go with --from_image: a stacks.json names its blocks")
+    if wanted.inventory is not None or wanted.budget is not None or wanted.cells != "auto":
+        raise StackgenError("--inventory, --budget and --cells go with --from_image: a stacks.json names its blocks")
     content = read_stacks(file)
     if not 1 <= wanted.stack <= len(content.entries):
         raise StackgenError(f"{file}: --stack must lie in 1..{len(content.entries)}, got {wanted.stack}")
@@ -201,6 +204,7 @@ def _from_image(image: Path, file: Path | None, wanted: Wanted, picture: Picture
             inventory=wanted.inventory,
             budget=wanted.budget,
             seed=wanted.seed,
+            cells=wanted.cells,
             most=len(wanted.cell.staging.slots),
             on_step=lambda: advance(next(done)),
         )
@@ -247,7 +251,7 @@ def _write(
     write_stacks(wanted.out / "stacks.json", replace(content, entries=(entry,), physics=physics))
 
 
-def _show(result: BuildReport) -> None:
+def _show(result: BuildReport, image: Path | None) -> None:
     """Print a row for each block, and what stands in the end."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # 80 columns hold it
     table.add_column("block", no_wrap=True)
@@ -277,6 +281,8 @@ def _show(result: BuildReport) -> None:
         f" {result.seconds:.0f} s of the arm's time, {result.real_time_factor:.1f} times real time"
     )
     tell(Text.assemble(word, words))
+    if image is not None and not result.success:
+        tell("fewer, larger blocks are easier to build: give fewer --cells, such as --cells 4", style="yellow")
 
 
 def _what_went_wrong(result: BuildReport) -> str:

@@ -30,6 +30,7 @@ def stacks_of_picture(
     inventory: str | None = None,
     budget: str | None = None,
     seed: int = 0,
+    cells: str = "auto",
     most: int | None = None,
     on_step: Callable[[], None] = lambda: None,
 ) -> StacksFile:
@@ -43,16 +44,20 @@ def stacks_of_picture(
         inventory: Blocks that there are, such as `cube=4,rectangle=3`.
         budget: Time such as `5s`, or number of stacks, that finding a stack may cost.
         seed: Seed of the stacks.
+        cells: Height, or width and height, of the structure, as `stackgen sample --cells`; `auto` finds it.
         most: Number of blocks that there is room for where the robot takes them from: of a picture whose best stacks
             need more the best at a smaller scale are taken.
         on_step: Called at most `NUMBER + 1` times, as the work proceeds.
 
     Raises:
-        StackgenError: If no stack stands.
+        StackgenError: If no stack stands, or `cells` is given with a model, which has one scale.
     """
     limit = None if budget is None else Budget.parse(budget)
     if model is None:
-        found = _at_best_scale(reading, seed, inventory, within(limit), most, on_step)
+        scales = ("auto", *map(str, SCALES)) if cells == "auto" else (cells,)
+        found = _at_best_scale(reading, scales, seed, inventory, within(limit), most, on_step)
+    elif cells != "auto":
+        raise StackgenError("--cells belongs to the search: leave out --weights")
     else:
         found = model.sample_verified(reading, NUMBER, seed, inventory=inventory, budget=limit, on_step=on_step)
     standing = tuple(entry for entry in found.entries if entry.verdict is not None and entry.verdict.stable)
@@ -64,22 +69,23 @@ def stacks_of_picture(
 
 def _at_best_scale(
     reading: Reading,
+    scales: Sequence[str],
     seed: int,
     inventory: str | None,
     search: SearchSettings,
     most: int | None,
     on_step: Callable[[], None],
 ) -> StacksFile:
-    """Find the best stacks at any scale; where these have too many blocks, those that fit best at the smaller ones."""
+    """Find the best stacks at the first scale; where these have too many blocks, those that fit best at any."""
     tried: list[tuple[float, StacksFile]] = []
-    for cells in ("auto", *map(str, SCALES)):
+    for cells in scales:
         found = best(reading, NUMBER, seed, inventory=inventory, cells=cells, search=search)
         on_step()
         if most is None:
             return found
         few = [entry.front_iou or 0.0 for entry in found.entries if len(entry.stack) <= most]
         tried.append((max(few, default=-1.0), found))
-        if cells == "auto" and few:
+        if cells == scales[0] and few:
             break
     return max(tried, key=lambda pair: pair[0])[1]
 

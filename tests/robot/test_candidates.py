@@ -58,6 +58,8 @@ def test_a_picture_of_which_no_stack_stands_is_one_line(towers: Model, monkeypat
     arch = read_picture(ROOT / "examples" / "silhouettes" / "arch.png", PAPER_GRID)
     with pytest.raises(StackgenError, match="none of the stacks that were tried stands; try a larger --budget"):
         stacks_of_picture(arch, "arch.png", towers, budget="3")
+    with pytest.raises(StackgenError, match="leave out --weights"):
+        stacks_of_picture(arch, "arch.png", towers, cells="4")
 
 
 def test_where_the_best_stacks_have_too_many_blocks_the_best_of_the_smaller_ones_are_taken(
@@ -74,6 +76,7 @@ def test_where_the_best_stacks_have_too_many_blocks_the_best_of_the_smaller_ones
     monkeypatch.setattr(candidates, "best", best)
     wall = read_picture(np.pad(np.ones((60, 60), bool), 9), PAPER_GRID)
     assert [len(stacks_of_picture(wall, "a", most=most).entries[0].stack) for most in (17, 12, 5)] == [17, 7, 5]
+    assert len(stacks_of_picture(wall, "a", cells="5", most=5).entries[0].stack) == 10  # as it was asked for
 
 
 def test_the_work_proceeds_in_no_more_steps_than_were_told_however_many_scales_are_tried() -> None:
