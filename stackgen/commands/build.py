@@ -189,6 +189,9 @@ def _from_image(image: Path, file: Path | None, wanted: Wanted, picture: Picture
     """Read a picture, write what was read, and sample stacks for it: those that stand, the best first."""
     if file is not None:
         raise StackgenError(f"give {file} or --from_image {image}, not both")
+    from stackgen.search.scale import Cells
+
+    Cells.parse(wanted.cells)  # before anything is written
     reading = read_picture(image, PAPER_GRID, **vars(picture))
     _make_folder(wanted.out)
     save_image(wanted.out / "overlay.png", reading.overlay)

@@ -65,6 +65,7 @@ def nothing_moves(monkeypatch: pytest.MonkeyPatch) -> None:
         ),
         (["{stacks}", "--inventory", "cube=1"], "--inventory, --budget and --cells go with --from_image"),
         (["{stacks}", "--cells", "4"], "--inventory, --budget and --cells go with --from_image"),
+        (["--from_image", "a.png", "--cells", "many"], "cells 'many': give auto, a height such as 6"),
         (["{stacks}", "--execute"], "say --arm ur-rtde"),
         (["{stacks}", "--arm", "ur-rtde", "--execute"], "needs the address of the arm's controller"),
         (["{stacks}", "--arm", "urscript", "--video", "a.gif"], "go with the simulated arm"),
