@@ -64,7 +64,8 @@ def drawing_samples(
 ) -> list[Sample]:
     """Make the answers to one drawing: some of the good layouts that the search finds, drawn evenly; there may be none.
 
-    Good is what fits within `near` of the best, before and after it has settled, and stands with `margin`.
+    Good is what fits within `near` of the best, before and after it has settled, and stands with `margin`; or with
+    `sure_margin`, if something does.
     """
     rng, how, world = _stream(settings, number), settings.drawings, settings.world
     drawing = _drawing(settings, excluded, rng)
@@ -75,6 +76,7 @@ def drawing_samples(
     if best < how.least_fit:
         return []
     good = [answer for answer in found if answer.margin >= how.margin]
+    good = [answer for answer in good if answer.margin >= how.sure_margin] or good
     settler, samples = _settler(settings, simulator), []
     for place in rng.permutation(len(good)).tolist():
         settled = settler.settle_rest(settler.at_rest(good[place].stack))

@@ -106,6 +106,25 @@ def test_good_answers_are_drawn_evenly(simulator: Simulator, monkeypatch: pytest
     assert max(times.values()) < 80 / len(times) * 2 and min(times.values()) > 80 / len(times) / 2.5
 
 
+def test_answers_that_hardly_stand_are_left_out_where_others_stand_surely(simulator: Simulator) -> None:
+    drawings = DrawingSettings(kinds={DESIGN: 1}, effort=0.02, known=8, answers=8)
+    mixed = 0
+    for number in range(12):
+        known = [
+            [
+                sample.meta["margin"]
+                for sample in drawing_samples(
+                    replace(DRAWN, drawings=replace(drawings, sure_margin=sure)), number, frozenset(), simulator
+                )
+            ]
+            for sure in (0.0, 0.2)
+        ]
+        sure = [margin for margin in known[0] if margin >= 0.2]
+        assert sorted(known[1]) == sorted(sure or known[0])
+        mixed += 0 < len(sure) < len(known[0])
+    assert mixed
+
+
 def test_silhouettes_and_designs_of_the_test_set_are_left_out(
     simulator: Simulator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
