@@ -27,6 +27,7 @@ WORK_SIZE = 768
 _SPECK = 0.005  # parts, and holes, under this share of the largest part are dirt
 _EDGE_BAND = 0.02  # width of the strip along the edge that shows the background [of the shorter edge]
 _BORDER = 0.03  # greatest width of a line along the picture's edge [of that edge]
+_EVEN, _ALL_EVEN = 0.7, 0.95  # share of the edge of one colour from which on the ground is, and there is no shadow
 _SHADOW = 0.03  # least share of a picture that is a shadow,
 _IN_SHADOW = 0.15  # and by which ink is darker than it, by how much darker it is than the paper itself
 
@@ -321,6 +322,7 @@ class Look:
         levels: (H, W, C) its colours, or opacity.
         place: (left, top) of these in the picture as it was read [pixel].
         flat: Whether neighbouring pixels are equal nearly everywhere, as drawing programs leave them and no camera.
+        shaded: Whether what is dark has strokes in it and reaches the edge, as a shadow does.
         two_tone: Whether it has two tones, but for grain and soft edges.
         even: Whether the background is of one colour: most places along the picture's edge are alike.
         on_white: Whether most of the picture's edge is light and colourless.
@@ -329,6 +331,7 @@ class Look:
     levels: Levels
     place: tuple[int, int]
     flat: bool
+    shaded: bool
     two_tone: bool
     even: bool
     on_white: bool
@@ -342,10 +345,10 @@ class Look:
     def drawn(self) -> bool:
         """Whether it is a drawing where no sheet of paper is in it.
 
-        Its ground is of one colour, or it has two tones only. What a camera saw has grain: on white it is the photo of
-        paper, whatever lies in its corners.
+        Its ground is of one colour, or it has two tones only. What a camera saw has grain: on white, or in a shadow, it
+        is the photo of paper, whatever lies in its corners.
         """
-        return self.two_tone or (self.even and (self.flat or not self.on_white))
+        return self.two_tone or (self.even and (self.flat or not (self.on_white or self.shaded)))
 
 
 def look_at(image: Image8) -> Look:
@@ -353,17 +356,17 @@ def look_at(image: Image8) -> Look:
     levels, place = _framed(*_levels(image))
     green = levels[..., levels.shape[2] // 2]
     same = (green[1:, 1:] == green[1:, :-1]) & (green[1:, 1:] == green[:-1, 1:])
-    edges = (levels[0], levels[-1], levels[:, 0], levels[:, -1])
-    tone = np.median(np.concatenate(edges), axis=0)
+    tone = np.median(np.concatenate((levels[0], levels[-1], levels[:, 0], levels[:, -1])), axis=0)
     step = max(1, max(levels.shape) // (WORK_SIZE // 2))
     some = np.moveaxis(levels[::step, ::step], 2, 0)
-    shaded = _is_shaded(some.min(axis=0))  # by a camera, however even its noise was made
+    shaded, evenness = _is_shaded(some.min(axis=0)), _evenness(levels)
     return Look(
         levels,
         place,
-        flat=not shaded and float(np.count_nonzero(same)) > 0.8 * same.size,
+        flat=not shaded and float(np.count_nonzero(same)) > 0.8 * same.size,  # however even a camera's noise was made
+        shaded=shaded and evenness < _ALL_EVEN,
         two_tone=not shaded and any(of_two_tones(end.reduce(some)) for end in (np.maximum, np.minimum)),
-        even=_is_even(levels),
+        even=evenness > _EVEN,
         on_white=bool(tone.min() > 140 and np.ptp(tone) < 40),
     )
 
@@ -384,8 +387,8 @@ def _is_shaded(values: NDArray[np.uint8]) -> bool:
     return bool((strokes[inner] > _IN_SHADOW * apart).mean() > 0.005)
 
 
-def _is_even(levels: Levels) -> bool:
-    """Tell whether most places along the edge of a picture (H, W, C) are of one colour."""
+def _evenness(levels: Levels) -> float:
+    """Return the share of the places along the edge of a picture (H, W, C) that are of one colour."""
     band = max(1, round(min(levels.shape[:2]) * 2 * _EDGE_BAND))
     places = [
         np.median(patch.reshape(-1, levels.shape[2]), axis=0)
@@ -394,4 +397,4 @@ def _is_even(levels: Levels) -> bool:
     ]
     tones = np.array(places)
     alike = np.abs(tones[:, None] - tones[None]).max(axis=2) < 0.6 * CONTRAST
-    return bool(alike.mean(axis=1).max() > 0.7)
+    return float(alike.mean(axis=1).max())

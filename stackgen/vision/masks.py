@@ -89,6 +89,8 @@ def largest(mask: Mask, gap: int) -> Mask:
     return np.asarray(mask & (labels == areas.argmax()))
 
 
+_DASHES = 12  # parts of like size that are one outline, drawn in dashes or by a crayon,
+_LIKE = 0.2  # least share of the area of the largest of them
 _MOST_PARTS = 30  # of smaller ones nothing hangs, and noise has hundreds
 
 
@@ -107,11 +109,16 @@ def near_parts(ink: Mask, together: float) -> list[Mask]:
     blank, _ = components(np.pad(~ink, 1, constant_values=True), connectivity=4)
     within = blank[1:-1, 1:-1] != blank[0, 0]
     far = cv2.distanceTransform((~(ink | within)).astype(np.uint8), cv2.DIST_L2, 3)
-    groups, _ = components(far <= together * size / 2)
-    groups = np.where(ink, groups, 0)
-    largest_first = 1 + np.argsort(-np.bincount(groups.ravel())[1:], kind="stable")
-    parts = [groups == number for number in sorted(largest_first[:_MOST_PARTS].tolist())]
-    return [part for part in parts if extent(part) > 0.1 * size] if size else []
+    reach = size / 3 if np.count_nonzero(areas > _LIKE * areas.max()) >= _DASHES else together * size / 2
+    while True:
+        groups, _ = components(far <= reach)
+        groups = np.where(ink, groups, 0)
+        largest_first = 1 + np.argsort(-np.bincount(groups.ravel())[1:], kind="stable")
+        parts = [groups == number for number in sorted(largest_first[:_MOST_PARTS].tolist())]
+        whole = max(extent(part) for part in parts)
+        if whole <= 2 * size:
+            return [part for part in parts if extent(part) > 0.1 * size]
+        size, reach = whole, together * whole / 2  # it was an outline of many dashes
 
 
 def smoothed(mask: Mask, size: int) -> Mask:

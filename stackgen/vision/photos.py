@@ -154,8 +154,9 @@ def _solids(light: NDArray[np.uint8]) -> tuple[Mask, NDArray[np.float32]]:
     steps, lengths, alike = _borders(regions, here, low, len(areas))
     ends = np.concatenate([end.ravel() for end in (regions[:2], regions[-2:], regions[:, :2], regions[:, -2:])])
     runs_off = np.bincount(ends, minlength=len(areas)) > 0.2 * np.sqrt(areas)
-    paper = runs_off & ((steps * lengths).sum(axis=1) >= np.log(_DARKER_THAN_SHADOW) * lengths.sum(axis=1))
-    paper[areas.argmax()] = True
+    lighter, around = (steps * lengths).sum(axis=1), np.maximum(lengths.sum(axis=1), 1)
+    paper = runs_off & (lighter >= np.log(_DARKER_THAN_SHADOW) * around)
+    paper[(areas * (lighter > -_SHARP * around)).argmax()] = True  # the largest may be the structure
     for _ in range(3):  # from what goes on to the edge, over the strokes of an outline, to what that stands around
         paper |= alike @ paper > _ALIKE
     ink = _darker(steps, lengths, paper)[regions]

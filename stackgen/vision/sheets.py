@@ -37,8 +37,10 @@ _TRIED = 40  # edges along which light is looked at
 _MOST_LINES = 8  # those of them, level and upright ones each, that may be sides, beside the photo's own
 _REACH = 500  # how far a line is followed to either side
 _BESIDE = 5  # how far from a side inside and outside are compared
+_STRIP = 2  # least width of what is seen of the table beyond a side
 _BEYOND = 14  # so far from it, to one side, a mere line is as it is on the other
 _LEAST_SEEN = 15  # a side of which less is seen tells nothing
+_LEVEL_TO = 3.0  # by this a border along the photo's edges may be out of level
 _AT_EDGE = 4.0  # what is nearer to the photo's edge is cut off by it
 _COLOURED = 200.0  # tint of paper of which no table has the colour: beyond a side that has it is a shadow
 _SAME = 0.12  # logarithm by which the light of the three channels may change otherwise in it
@@ -46,6 +48,11 @@ _LEVEL = 0.95  # light beyond a dark line by that before it
 
 _LARGE = 0.45  # exponent of its area: what a shadow divides off is smaller
 
+_TRIMMED = 0.04  # share of a side at either end that tells nothing of it
+_ONWARD = (4, 34)  # so far beyond its corners a sheet has ended; what a shadow divides off goes on there
+_GOES_ON = 0.8  # along at least this share of that
+_AS_DEEP = 0.6  # and nearly as deep; stripes of a table are less
+_ONE_MORE = 0.7  # what each side costs that does
 _UNSEEN = 0.8  # what each side costs that is not seen
 
 
@@ -91,8 +98,9 @@ def _edges(small: Picture) -> Floats:
     detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD)
     pieces = []
     for levels in (_log(least_channel(small)), _log(small.max(axis=2)), _tint(small)):
-        closed = cv2.morphologyEx(as_bytes(levels), cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))
-        found = detector.detect(closed)[0]
+        wide = cv2.copyMakeBorder(as_bytes(levels), 9, 9, 9, 9, cv2.BORDER_REPLICATE)  # a strip of table is no ink
+        closed = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))[9:-9, 9:-9]
+        found = detector.detect(np.ascontiguousarray(closed))[0]
         if found is not None:
             pieces.append(found.reshape(-1, 2, 2).astype(np.float64))
     if not pieces:
@@ -114,13 +122,19 @@ def _joined(ends: Floats) -> Floats:
         for _ in range(2):
             across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
             members = np.abs((ends - at) @ across).max(axis=1) < 3
-            x, y, *there = cv2.fitLine(
-                ends[members].reshape(-1, 2).astype(np.float32), cv2.DIST_L2, 0, 0.01, 0.01
-            ).ravel()
-            at, along = np.array(there, np.float64), np.array([x, y], np.float64)
+            at, along = _line_along(ends[members])
         free &= ~members
         lines.append([at, at + along])
     return np.array(lines[:_TRIED]).reshape(-1, 2, 2)
+
+
+def _line_along(pieces: Floats) -> tuple[Floats, Floats]:
+    """Fit a line to pieces of edges (n, 2, 2), by their lengths; return a point (2,) and its direction (2,)."""
+    lengths = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1)
+    at = lengths @ pieces.mean(axis=1) / lengths.sum()
+    x, y = (pieces - at).transpose(2, 0, 1)
+    angle = np.arctan2(2 * (lengths @ (x * y)).sum(), (lengths @ (x * x - y * y)).sum()) / 2
+    return at, np.array([np.cos(angle), np.sin(angle)])
 
 
 def _log(levels: Picture) -> NDArray[np.float32]:
@@ -146,24 +160,28 @@ def _best_quadrangle(small: Picture, lines: Floats) -> tuple[Floats, float] | No
     sides, corners, ends = _quadrangles(lines, small.shape)
     if not len(sides):
         return None
-    across = _normals(lines)[sides]
-    inside = ((corners.mean(axis=1)[:, None] - lines[sides, 0]) * across).sum(axis=2) > 0
+    inside = ((corners.mean(axis=1)[:, None] - lines[sides, 0]) * _normals(lines)[sides]).sum(axis=2) > 0
     low, high = np.sort(ends, axis=2).transpose(2, 0, 1)
-    trimmed = 0.04 * (high - low)
-    start, end = (
-        np.clip(np.round(place + _REACH), 0, 2 * _REACH).astype(int) for place in (low + trimmed, high - trimmed)
-    )
-    of = known[sides, end] - known[sides, start]
+
+    def between(start: Floats, end: Floats) -> tuple[Floats, Floats, Floats]:
+        """Return at how many places (Q, 4) between two a side is known, at which share it steps down, and how deep."""
+        first, last = (np.clip(np.round(place + _REACH), 0, 2 * _REACH).astype(int) for place in (start, end))
+        of = known[sides, last] - known[sides, first]
+        share, deep = ((told[inside * 1, sides, last] - told[inside * 1, sides, first]) for told in (steps, depths))
+        return of, share / np.maximum(of, 1), deep / np.maximum(of, 1)
+
+    of, share, deep = between(low + _TRIMMED * (high - low), high - _TRIMMED * (high - low))
     seen = of >= _LEAST_SEEN
-
-    def least(told: Floats) -> Floats:
-        """Return the mean of what is told of the places along a side, of that side of each quadrangle of least."""
-        share = (told[inside * 1, sides, end] - told[inside * 1, sides, start]) / np.maximum(of, 1)
-        return np.asarray(np.where(seen, share, 1).min(axis=1))
-
-    sureness, depth = least(steps), least(depths)
+    sureness, depth = (np.where(seen, told, 1).min(axis=1) for told in (share, deep))
+    mean = (share * seen).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
+    onward = np.zeros(len(sides))
+    for start, end in ((high + _ONWARD[0], high + _ONWARD[1]), (low - _ONWARD[1], low - _ONWARD[0])):
+        there, steady, as_deep = between(start, end)
+        goes_on = (there >= _LEAST_SEEN) & (steady > _GOES_ON) & (as_deep > _AS_DEEP * deep)
+        onward += np.count_nonzero(goes_on, axis=1)
     areas = np.abs(_cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)) / 2 / (small.shape[0] * small.shape[1])
-    score = sureness * depth**0.5 * np.minimum(areas, 1) ** _LARGE * _UNSEEN ** np.count_nonzero(~seen, axis=1)
+    score = sureness * mean * depth**0.5 * np.minimum(areas, 1) ** _LARGE
+    score *= _UNSEEN ** np.count_nonzero(~seen, axis=1) * _ONE_MORE**onward
     enough = (np.count_nonzero(seen, axis=1) > 2) | ((np.count_nonzero(seen, axis=1) == 2) & (areas > 0.5))
     score[(sureness < SUPPORT) | ~enough | _is_frame(corners, small.shape)] = 0
     best = int(score.argmax())
@@ -207,27 +225,27 @@ def _steps(small: Picture, lines: Floats) -> tuple[Floats, Floats, Floats]:
         (2, N, T + 1) at how many places it does, with the paper on the one side and on the other; (2, N, T + 1) how
         deep, up to 1 each; and (N, T + 1) at how many both sides are seen: none of the last four, the photo's own.
     """
-    middle = np.median(small, axis=2)
-    levels = [np.asarray(of, np.float32) for of in (least_channel(small), small.max(axis=2), _tint(small), middle)]
+    seen = (least_channel(small), small.max(axis=2), _tint(small), *cv2.split(small))
+    levels = [np.asarray(of, np.float32) for of in seen]
     size = np.array(small.shape[1::-1])
     points = lines[:, :1] + np.arange(-_REACH, _REACH)[:, None] * (lines[:, 1:] - lines[:, :1])
 
-    def beside(shift: int) -> tuple[list[NDArray[np.float32]], NDArray[np.bool_]]:
+    def beside(shift: int) -> list[NDArray[np.float32]]:
         there = np.round(points + shift * _normals(lines)[:, None]).astype(int)
         x, y = np.clip(there, 0, size - 1).transpose(2, 0, 1)
-        return [of[y, x] for of in levels], np.asarray(((there >= 0) & (there < size)).all(axis=2))
+        return [of[y, x] for of in levels]
 
+    known = np.asarray(((points >= _STRIP) & (points < size - _STRIP)).all(axis=2))
+    known[-4:] = False
     counts, depths = [], []
     for side in (-1, 1):
-        (light, value, tint, mean), here = beside(side * _BESIDE)
-        (dark, low, dull, grey), there = beside(-side * _BESIDE)
-        (far, high, away, _), _ = beside(-side * _BEYOND)
-        (within, *_), _ = beside(side * _BEYOND)
-        known = here & there
-        known[-4:] = False
-        shares = [(one + 8) / (other + 8) for one, other in ((light, dark), (mean, grey), (value, low))]
-        darker = np.log(np.maximum(shares[0], shares[2]))
-        in_shadow = (tint < _COLOURED) & (np.ptp(np.log(shares), axis=0) < _SAME)
+        light, value, tint, *colours = beside(side * _BESIDE)
+        dark, low, dull, *others = beside(-side * _BESIDE)
+        far, high, away, *_ = beside(-side * _BEYOND)
+        within, *_ = beside(side * _BEYOND)
+        darker = np.log(np.maximum((light + 8) / (dark + 8), (value + 8) / (low + 8)))
+        shares = [np.log((one + 8) / (other + 8)) for one, other in zip(colours, others, strict=True)]
+        in_shadow = (tint < _COLOURED) & (np.ptp(shares, axis=0) < _SAME)
         down = np.maximum(darker / 0.13, (tint - dull) / 18)
         dark_line = (far > _LEVEL * light) & (high > _LEVEL * value) & (away > tint - 9)
         light_line = within + 8 < np.minimum(0.7 * (light + 8), 1.15 * (dark + 8))
@@ -254,10 +272,11 @@ def _cross(one: Floats, two: Floats) -> Floats:
 
 
 def _is_frame(corners: Floats, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Tell which quadrangles (Q, 4, 2) are a border along the photo's edges rather than a sheet."""
+    """Tell which quadrangles (Q, 4, 2) are a border along the photo's edges, and level, rather than a sheet."""
     ends = _frame(shape)[:, 0]
     far = np.abs(corners[:, :, None] - ends).max(axis=3).min(axis=1).max(axis=1)
-    return np.asarray(far < 0.05 * max(shape))
+    askew = np.abs(corners - np.roll(corners, 1, axis=1)).min(axis=2).max(axis=1)
+    return np.asarray((far < 0.05 * max(shape)) & (askew < _LEVEL_TO))
 
 
 def _cut_sides(corners: Floats, shape: tuple[int, ...]) -> list[int]:

@@ -10,6 +10,8 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import iou
 from stackgen.vision.ink.choice import choose
 from stackgen.vision.ink.outlines import fill
+from stackgen.vision.ink.rules import without_rules
+from stackgen.vision.photos import find_ink
 from stackgen.world import Mask
 
 ARCH = np.array([[100, 100], [400, 100], [400, 400], [300, 400], [300, 200], [200, 200], [200, 400], [100, 400]])
@@ -157,3 +159,52 @@ def test_what_the_ground_line_may_close_between_blocks_is_doubted() -> None:
 def test_a_drawing_that_runs_off_is_not_replaced_by_less_without_a_word() -> None:
     ink = drawn(np.array([[0, 100], [300, 100], [300, 400], [0, 400]]), box(420, 100, 500, 180))
     assert "uncertain" in " ".join(choose(ink).notes)
+
+
+def test_dots_of_the_paper_beside_a_drawing_are_dirt() -> None:
+    ink = solid(ARCH)
+    ink[12:500:30, 12:600:30] = ink[13:500:30, 12:600:30] = ink[12:500:30, 13:600:30] = True
+    ink[12:500:30, 11:600:30] = ink[11:500:30, 12:600:30] = ink[12:500:30, 14:600:30] = True
+    assert iou(choose(ink).mask, solid(ARCH)) > 0.99
+
+
+def test_an_outline_of_many_dashes_is_one_drawing() -> None:
+    ink = drawn(ARCH, width=4)
+    y, x = np.mgrid[:500, :600]
+    ink &= (x + y) % 24 < 16
+    assert iou(choose(ink).mask, solid(ARCH)) > 0.95
+
+
+@pytest.mark.parametrize("width", [6, 12])
+def test_a_base_that_is_drawn_right_on_the_ground_line_is_kept(width: int) -> None:
+    ink = drawn(box(150, 150, 300, 400), box(300, 250, 420, 400), width=width)
+    level = 400 + width + np.round(2 * np.sin(np.arange(600) / 20)).astype(int)
+    for column in range(20, 560):
+        ink[level[column] - width // 2 : level[column] + width // 2, column] = True
+    found = choose(ink).mask
+    rows = np.flatnonzero(found.any(axis=1))
+    assert abs(rows[-1] - 400) <= 2
+
+
+def test_a_large_part_that_touches_only_at_a_corner_is_not_taken_for_a_name() -> None:
+    base, top = box(100, 300, 250, 400), box(256, 150, 420, 295)
+    assert iou(choose(solid(base, top)).mask, solid(base, top)) > 0.95
+
+
+@pytest.mark.parametrize("kind", ["hidden", "faint"])
+def test_lines_of_the_paper_are_erased_where_a_drawing_hides_them_or_they_are_faint(kind: str) -> None:
+    wall = solid(box(80, 150, 480, 270)) if kind == "hidden" else solid(box(200, 150, 400, 270))
+    lines = np.zeros_like(wall)
+    lines[20::30] = lines[21::30] = True
+    lines[:, ::40] &= False
+    if kind == "faint":
+        lines &= np.arange(600) % 45 < 16
+    ink, ruled = without_rules(wall | lines, np.where(wall, 0.8, 0.2).astype(np.float32))
+    assert ruled and np.count_nonzero(ink & ~wall) < 0.002 * wall.sum()
+
+
+def test_a_structure_that_is_larger_than_any_piece_of_the_paper_is_ink() -> None:
+    sheet = np.full((500, 700, 3), 235, dtype=np.uint8)
+    sheet[60:440, 90:610] = 70
+    ink, _ = find_ink(sheet)
+    assert ink[60:440, 90:610].mean() > 0.98 and ink[:50].mean() < 0.01

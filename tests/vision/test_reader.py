@@ -57,6 +57,12 @@ def test_the_sketch_in_a_photo_is_read(stack: Stack, paper: str) -> None:
     assert reading.kind == "photo" and overlap(reading, stack) >= 0.88
 
 
+def test_coloured_paper_half_in_a_shadow_is_a_photo_where_no_table_is_seen() -> None:
+    paper = {"tone": (242, 228, 130), "zoom": 1.6, "slant": 0.02, "turn": 2, "light": 0.1, "shadow": 0.5, "softness": 3}
+    reading = read_picture(photo_of(HOUSE, style="outline", width=12, seed=12, **paper), PAPER_GRID)
+    assert reading.kind == "photo" and overlap(reading, HOUSE) >= 0.88
+
+
 @pytest.mark.parametrize("name", STACKS)
 def test_the_examples_show_their_stacks(name: str) -> None:
     reading = read_picture(PHOTOS / f"sketch-{name.lower()}.jpg", PAPER_GRID)

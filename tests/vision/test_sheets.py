@@ -105,3 +105,27 @@ def test_a_drawing_without_a_sheet_is_set_upright_by_its_own_sides() -> None:
     rows = np.flatnonzero(straight.any(axis=1))
     widths = straight[rows].sum(axis=1)
     assert widths[3 : len(rows) // 3].std() < 4 and widths[3] == pytest.approx(2.5 * widths[-5], rel=0.06)
+
+
+@pytest.mark.parametrize("softness", [2.0, 8.0])
+def test_what_a_deep_shadow_divides_off_is_no_sheet(softness: float) -> None:
+    corners = np.array([[210, 218], [780, 214], [928, 602], [72, 618]]) * [0.82, 0.95]
+    shade = np.ones((600, 800), dtype=np.float32)
+    cv2.fillPoly(shade, [np.array([[-100, 150], [340, 170], [375, 700], [-100, 700]])], 0.35)
+    photo = photo_with(corners, table=(165, 160, 150)) * cv2.GaussianBlur(shade, (0, 0), softness)[..., None]
+    sheet = find_sheet(photo.astype(np.uint8))
+    assert sheet is not None and np.abs(sheet.corners - corners).max() < 6
+
+
+def test_coloured_paper_on_a_table_of_another_colour_is_not_in_a_shadow() -> None:
+    corners = np.array([[150, 160], [650, 163], [795, 520], [2, 510]])
+    photo = np.full((600, 800, 3), (37, 55, 65), dtype=np.uint8)
+    cv2.fillPoly(photo, [corners.astype(np.int32)], (233, 222, 133))
+    sheet = find_sheet(photo)
+    assert sheet is not None and np.abs(sheet.corners - corners).max() < 4
+
+
+def test_a_sheet_that_fills_the_photo_but_for_a_strip_of_table_is_found() -> None:
+    corners = np.array([[14, 24], [786, 36], [790, 582], [6, 572]])
+    sheet = find_sheet(photo_with(corners))
+    assert sheet is not None and np.abs(sheet.corners - corners).max() < 5

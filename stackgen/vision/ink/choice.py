@@ -13,7 +13,7 @@ import numpy as np
 from stackgen.errors import StackgenError
 from stackgen.vision.ink.ground import without_ground
 from stackgen.vision.ink.outlines import Filled, fill, loose
-from stackgen.vision.masks import bounding_box, extent, is_round, largest, near_parts, rim
+from stackgen.vision.masks import bounding_box, extent, is_round, largest, near_parts, rim, without_specks
 from stackgen.world import Mask
 
 FINE = 420
@@ -25,10 +25,13 @@ RIVAL = 0.2
 TOGETHER = 0.07
 """What is nearer than this, by the size of the largest part, is one drawing."""
 
+_DIRT = 0.004  # parts under this share of the largest one are dirt,
+_MOST_DIRT = 0.08  # where all of it is no more than this share of the ink
 _SURE = 0.82  # a drawing without any of its ground line counts from this share of the sureness with it on,
 _ALIKE = 0.02  # and where no more of its strokes enclose nothing than with it, but for this share
 _EDGE = 0.02  # what is nearer to the sheet's edge runs off it, by its longer edge
 _APART = 0.03  # what is further from its largest part is beside it, half of that where it is solid, by its size
+_SMALL = 0.15  # or smaller than this share of it,
 _LEVEL = 0.06  # feet of one structure are level to within this, by its size
 _FOOT = 0.08  # what is this much above its lowest point stands on the ground, by its size
 
@@ -50,6 +53,9 @@ def choose(
     Raises:
         StackgenError: If there are several drawings and none is asked for, fewer than asked for, or an outline is open.
     """
+    clean = without_specks(ink, _DIRT)
+    if np.count_nonzero(clean) > (1 - _MOST_DIRT) * np.count_nonzero(ink):  # else the drawing is made of specks
+        ink = clean
     edge = rim(ink.shape, round(_EDGE * max(ink.shape)))
     if beyond is not None:
         edge |= beyond
@@ -74,11 +80,7 @@ def _chosen(ink: Mask, edge: Mask, which: int | None, spread: bool, framed: bool
             seen, cut = inner, [group for group, part in seen if _at_edge(group, part, edge)]
     drawings = _that_can_be_read(seen, cut=bool(cut))
     if not spread:
-        # A name is drawn near the structure, too: what is not right beside its largest part is left out.
-        drawings = [
-            replace(one, mask=largest(one.mask, round((_APART if one.stroke else _APART / 2) * extent(one.mask))))
-            for one in drawings
-        ]
+        drawings = [replace(one, mask=_without_name(one)) for one in drawings]
     most = max(np.count_nonzero(part.mask) for part in drawings)
     rivals = [part for part in drawings if np.count_nonzero(part.mask) >= RIVAL * most]
     rivals.sort(key=lambda part: bounding_box(part.mask)[1].start)
@@ -100,6 +102,19 @@ def _chosen(ink: Mask, edge: Mask, which: int | None, spread: bool, framed: bool
         notes = (*notes, "Something larger runs off, so which drawing counts is uncertain.")
     mask = np.any([part.mask for part in (main, *beside)], axis=0)
     return Filled(mask, main.stroke, notes, main.sureness * (0.95 if left_out else 1.0))
+
+
+def _without_name(drawing: Filled) -> Mask:
+    """Leave out what is small and not right beside the largest part (H, W): a name is drawn near the structure, too."""
+    apart = round((_APART if drawing.stroke else _APART / 2) * extent(drawing.mask))
+    kept = largest(drawing.mask, apart)
+    rest = drawing.mask & ~kept
+    while np.count_nonzero(rest) > _SMALL * np.count_nonzero(kept):
+        one = largest(rest, apart)
+        if np.count_nonzero(one) <= _SMALL * np.count_nonzero(kept):
+            break
+        kept, rest = kept | one, rest & ~one
+    return kept
 
 
 def _that_can_be_read(seen: list[tuple[Mask, Filled | StackgenError]], cut: bool) -> list[Filled]:
@@ -141,11 +156,29 @@ def _one(group: Mask) -> Filled | StackgenError:
         notes = (*chosen.notes, "The ground line was left out.")
         if chosen is not bodies[0] and _is_between(inks[-1], chosen.mask):
             notes = (*notes, "Whether there is a gap between two blocks on the ground line is uncertain.")
-        return replace(chosen, notes=notes)
+        return replace(chosen, mask=_footed(chosen, group), notes=notes)
     try:
         return fill(group)
     except StackgenError as error:
         return error
+
+
+def _footed(filled: Filled, ink: Mask) -> Mask:
+    """Let what was filled (H, W) reach down to half a stroke below the upper edge of the line that it stands on."""
+    if not filled.stroke:
+        return filled.mask
+    mask, half = filled.mask.copy(), round(filled.stroke / 2)
+    rows = np.arange(len(mask))[:, None]
+    bottom = np.where(mask.any(axis=0), len(mask) - 1 - mask[::-1].argmax(axis=0), -1)
+    line = ink & (np.abs(rows - bottom) <= 2 * half)
+    foot = np.flatnonzero((bottom > bottom.max() - _FOOT * extent(mask)) & line.any(axis=0))
+    if foot.size:
+        edge = line[:, foot].argmax(axis=0)
+        lowest = max(0, int(edge.max()) - 255)
+        edge = lowest + cv2.medianBlur(np.maximum(edge - lowest, 0).astype(np.uint8)[None], 8 * half + 1)[0].astype(int)
+        mask[:, foot] &= rows < edge + half  # upright strokes do not end on it
+        mask[:, foot] |= (rows > bottom[foot]) & (rows < edge + half)
+    return mask
 
 
 def _is_between(ink: Mask, mask: Mask) -> bool:

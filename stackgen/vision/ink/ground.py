@@ -77,17 +77,17 @@ def _erased_along(ink: Mask, path: NDArray[np.int64], width: float) -> Mask:
     """Erase a line of some width along its row in each column (W,), and what is below it; what stands on it stays."""
     body = ink.copy()
     reach = max(2, round(0.75 * width))
-    thick = np.zeros((1, len(path)), dtype=np.uint8)
-    for column in np.flatnonzero(path >= 0):
-        run = np.flatnonzero(ink[max(0, path[column] - 2 * reach) : path[column] + 2 * reach + 1, column])
-        thick[0, column] = min(int(np.ptp(run)), 255) if run.size else 0
-    smooth = cv2.medianBlur(thick, 4 * reach + 1)[0]  # a pen leaves holes in both lines, and strays
+    off = np.arange(len(ink))[:, None] - path
+    band = ink & (np.abs(off) <= 2 * reach) & (path >= 0)
+    high, low = band.argmax(axis=0), len(ink) - 1 - band[::-1].argmax(axis=0)
+    thick = np.where(band.any(axis=0), np.minimum(low - high, 255), 0).astype(np.uint8)
+    smooth = cv2.medianBlur(thick[None], 4 * reach + 1)[0]  # a pen leaves holes in both lines, and strays
     alone = (smooth <= 1.35 * width) & (path >= 0)
-    for column in np.flatnonzero(alone):
-        body[max(0, path[column] - reach) : path[column] + reach + 1, column] = False
+    body[alone & (np.abs(off) <= reach)] = False
     free = np.flatnonzero(alone)
-    for column in np.flatnonzero((path >= 0) & ~alone) if free.size else ():
-        body[round(float(np.interp(column, free, path[free]))) :, column] = False
+    if free.size:
+        middle = np.round(np.interp(np.arange(len(path)), free, path[free]))
+        body[(path >= 0) & ~alone & (np.arange(len(ink))[:, None] >= middle)] = False
     return body
 
 

@@ -40,6 +40,8 @@ _SOLID = 1.3
 LOOSE = 0.3
 """Share of the strokes that may enclose nothing before an outline counts as open."""
 
+_MOST = 0.6  # share of what is enclosed at most that is enough
+
 _NONE = 0.015  # share of them that is none: the sides of one block of many, between two others, are more,
 
 _NEARLY = 0.94  # as is that block's share of what is enclosed
@@ -140,11 +142,19 @@ def _least_gap(ink: Mask, size: int) -> _Trial:
         trials.append(_trial(ink, size, gap))
         if trials[0].loose < _NONE:
             return trials[0]
-    enough = [trial for trial in trials if trial.enclosed >= 0.6 * max(trial.enclosed for trial in trials)]
+        if trials[-1].loose < _NONE and trials[-1].enclosed >= _MOST * _hull_area(ink):
+            break  # wider ones enclose hardly more
+    enough = [trial for trial in trials if trial.enclosed >= _MOST * max(trial.enclosed for trial in trials)]
     least = min(trial.loose for trial in enough)
     best = next(trial for trial in enough if trial.loose <= least + _NONE)
     alike = [trial for trial in enough if trial.enclosed >= _NEARLY * best.enclosed and trial.loose <= least + 0.1]
     return alike[0]
+
+
+def _hull_area(ink: Mask) -> float:
+    """Return the area of the convex hull of ink (H, W) [pixel], more than which nothing can enclose."""
+    hull = cv2.convexHull(cv2.findNonZero(ink.astype(np.uint8)))
+    return cv2.contourArea(hull)
 
 
 def _trial(ink: Mask, size: int, gap: float) -> _Trial:

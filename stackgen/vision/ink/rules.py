@@ -5,6 +5,8 @@ Legend: H x W pixels.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +26,8 @@ FAINTEST = 0.15
 SLOPE = 6.0
 """Lines of paper are level or upright to within this [deg]."""
 
+_FAINT = 0.25  # share of a line's length that is seen of it where it is faint,
+_MANY = 8  # and how many of these there are, at least
 _HAIR = 0.005  # greatest width of a line of paper, by the sheet's longer edge
 
 
@@ -76,14 +80,49 @@ def _rules(ink: Mask, fewest: int) -> list[tuple[float, float]]:
         ends = [(x < 0.3 * width), (x >= 0.7 * width), np.full(len(x), True)]
         counts = [np.convolve(np.bincount(rows[e], minlength=height + 2 * width), np.ones(5), "same") for e in ends]
         share = np.minimum(np.minimum(counts[0], counts[1]) / 0.3, counts[2] * 0.5 / LONG) / width
-        taken = np.zeros(len(x), dtype=bool)
-        while share.max(initial=0) > 0.5:
-            peak = int(share.argmax())
-            found.append((float(peak - width), slope))
-            share[max(0, peak - 2 * hair) : peak + 2 * hair + 1] = 0
-            taken |= np.abs(rows - peak) <= hair
+        peaks = _peaks(share, 2 * hair, 0.5)
+        if len(peaks) < FEWEST and len(faint := _peaks(share, 2 * hair, _FAINT)) >= _MANY:
+            peaks = faint
+        if len(peaks) >= FEWEST:
+            peaks = np.append(peaks, _between(peaks, np.maximum(counts[0], counts[1]) / 0.3 / width, hair))
+        found += [(float(peak - width), slope) for peak in peaks]
+        taken = (np.abs(rows[:, None] - peaks) <= hair).any(axis=1)
         y, x = y[~taken], x[~taken]
     return found if len(found) >= fewest else []
+
+
+def _peaks(share: NDArray[np.float64], apart: int, least: float) -> NDArray[np.int64]:
+    """Return the rows at which a share (n,) is most, and over the least, no two of them nearer than `apart` [pixel]."""
+    share, found = share.copy(), []
+    while share.max(initial=0) > least:
+        found.append(int(share.argmax()))
+        share[max(0, found[-1] - apart) : found[-1] + apart + 1] = 0
+    return np.array(found, np.int64)
+
+
+def _between(peaks: NDArray[np.int64], share: NDArray[np.float64], near: int) -> list[int]:
+    """Return the rows of further lines, which a drawing or a shadow hides in part: where the others' distance has them.
+
+    Args:
+        peaks: (k,) rows of the lines that are known.
+        share: (n,) along which share of the side where it is seen best there is a line in each row.
+        near: How far they may lie from where they should be [pixel].
+    """
+    rows = np.sort(peaks)
+    steps = np.diff(rows)
+    step = float(np.median(steps[steps < 1.5 * steps.min()]))
+    first = rows[0] - step * np.arange(1, rows[0] // step)
+    last = rows[-1] + step * np.arange(1, (len(share) - rows[-1]) // step)
+    where = [first, last]
+    for low, high in pairwise(rows):
+        parts = max(1, round((high - low) / step))
+        where.append(low + (high - low) / parts * np.arange(1, parts))
+    found = []
+    for row in np.round(np.concatenate(where)).astype(int):
+        best = row - near + int(share[max(0, row - near) : row + near + 1].argmax())
+        if share[best] > 0.5:
+            found.append(best)
+    return found
 
 
 def _slopes(y: NDArray[np.int64], x: NDArray[np.int64], width: int) -> list[float]:
