@@ -358,7 +358,7 @@ def look_at(image: Image8) -> Look:
     same = (green[1:, 1:] == green[1:, :-1]) & (green[1:, 1:] == green[:-1, 1:])
     tone = np.median(np.concatenate((levels[0], levels[-1], levels[:, 0], levels[:, -1])), axis=0)
     step = max(1, max(levels.shape) // (WORK_SIZE // 2))
-    some = np.moveaxis(levels[::step, ::step], 2, 0)
+    some = np.ascontiguousarray(np.moveaxis(levels[::step, ::step], 2, 0))
     shaded, evenness = _is_shaded(some.min(axis=0)), _evenness(levels)
     return Look(
         levels,

@@ -53,6 +53,7 @@ _ONWARD = (4, 34)  # so far beyond its corners a sheet has ended; what a shadow 
 _GOES_ON = 0.8  # along at least this share of that
 _AS_DEEP = 0.6  # and nearly as deep; stripes of a table are less
 _ONE_MORE = 0.7  # what each side costs that does
+_LIKE = 0.3  # a quadrangle that is less like a sheet, of all that but its size, is none
 _UNSEEN = 0.8  # what each side costs that is not seen
 
 
@@ -97,7 +98,7 @@ def _edges(small: Picture) -> Floats:
     """Find straight edges (N, 2, 2) of light and colour; ink is closed before."""
     detector = cv2.createLineSegmentDetector(cv2.LSD_REFINE_STD)
     pieces = []
-    for levels in (_log(least_channel(small)), _log(small.max(axis=2)), _tint(small)):
+    for levels in (_log(least_channel(small)), _log(_most_channel(small)), _tint(small)):
         wide = cv2.copyMakeBorder(as_bytes(levels), 9, 9, 9, 9, cv2.BORDER_REPLICATE)  # a strip of table is no ink
         closed = cv2.morphologyEx(wide, cv2.MORPH_CLOSE, np.ones((9, 9), np.uint8))[9:-9, 9:-9]
         found = detector.detect(np.ascontiguousarray(closed))[0]
@@ -180,10 +181,10 @@ def _best_quadrangle(small: Picture, lines: Floats) -> tuple[Floats, float] | No
         goes_on = (there >= _LEAST_SEEN) & (steady > _GOES_ON) & (as_deep > _AS_DEEP * deep)
         onward += np.count_nonzero(goes_on, axis=1)
     areas = np.abs(_cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)) / 2 / (small.shape[0] * small.shape[1])
-    score = sureness * mean * depth**0.5 * np.minimum(areas, 1) ** _LARGE
-    score *= _UNSEEN ** np.count_nonzero(~seen, axis=1) * _ONE_MORE**onward
+    like = sureness * mean * depth**0.5 * _UNSEEN ** np.count_nonzero(~seen, axis=1) * _ONE_MORE**onward
+    score = like * np.minimum(areas, 1) ** _LARGE
     enough = (np.count_nonzero(seen, axis=1) > 2) | ((np.count_nonzero(seen, axis=1) == 2) & (areas > 0.5))
-    score[(sureness < SUPPORT) | ~enough | _is_frame(corners, small.shape)] = 0
+    score[(sureness < SUPPORT) | (like < _LIKE) | ~enough | _is_frame(corners, small.shape)] = 0
     best = int(score.argmax())
     return (_clockwise(corners[best]), float(sureness[best])) if score[best] else None
 
@@ -225,15 +226,16 @@ def _steps(small: Picture, lines: Floats) -> tuple[Floats, Floats, Floats]:
         (2, N, T + 1) at how many places it does, with the paper on the one side and on the other; (2, N, T + 1) how
         deep, up to 1 each; and (N, T + 1) at how many both sides are seen: none of the last four, the photo's own.
     """
-    seen = (least_channel(small), small.max(axis=2), _tint(small), *cv2.split(small))
-    levels = [np.asarray(of, np.float32) for of in seen]
+    seen = (least_channel(small), _most_channel(small), _tint(small), *cv2.split(small))
+    levels = [np.asarray(of, np.float32).ravel() for of in seen]
     size = np.array(small.shape[1::-1])
     points = lines[:, :1] + np.arange(-_REACH, _REACH)[:, None] * (lines[:, 1:] - lines[:, :1])
 
-    def beside(shift: int) -> list[NDArray[np.float32]]:
+    def beside(shift: int, count: int = len(levels)) -> list[NDArray[np.float32]]:
         there = np.round(points + shift * _normals(lines)[:, None]).astype(int)
         x, y = np.clip(there, 0, size - 1).transpose(2, 0, 1)
-        return [of[y, x] for of in levels]
+        index = y * size[0] + x
+        return [of[index] for of in levels[:count]]
 
     known = np.asarray(((points >= _STRIP) & (points < size - _STRIP)).all(axis=2))
     known[-4:] = False
@@ -241,8 +243,8 @@ def _steps(small: Picture, lines: Floats) -> tuple[Floats, Floats, Floats]:
     for side in (-1, 1):
         light, value, tint, *colours = beside(side * _BESIDE)
         dark, low, dull, *others = beside(-side * _BESIDE)
-        far, high, away, *_ = beside(-side * _BEYOND)
-        within, *_ = beside(side * _BEYOND)
+        far, high, away = beside(-side * _BEYOND, 3)
+        (within,) = beside(side * _BEYOND, 1)
         darker = np.log(np.maximum((light + 8) / (dark + 8), (value + 8) / (low + 8)))
         shares = [np.log((one + 8) / (other + 8)) for one, other in zip(colours, others, strict=True)]
         in_shadow = (tint < _COLOURED) & (np.ptp(shares, axis=0) < _SAME)
@@ -353,9 +355,14 @@ def least_channel(picture: Picture) -> NDArray[np.uint8]:
     return np.asarray(cv2.min(cv2.min(picture[..., 0], picture[..., 1]), picture[..., 2]), np.uint8)
 
 
+def _most_channel(picture: Picture) -> NDArray[np.uint8]:
+    """Return the largest channel (h, w) of a colour picture."""
+    return np.asarray(cv2.max(cv2.max(picture[..., 0], picture[..., 1]), picture[..., 2]), np.uint8)
+
+
 def _tint(small: Picture) -> NDArray[np.float32]:
     """Return how colourless each pixel is, 255 for grey: least by largest channel, which a shadow hardly changes."""
-    most = cv2.max(cv2.max(small[..., 0], small[..., 1]), small[..., 2]).astype(np.float32)
+    most = _most_channel(small).astype(np.float32)
     return np.asarray(255 * (least_channel(small).astype(np.float32) + 8) / (most + 8), np.float32)
 
 

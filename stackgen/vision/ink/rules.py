@@ -23,7 +23,7 @@ FEWEST = 4
 FAINTEST = 0.15
 """The darkest place of a drawing is at least so dark."""
 
-SLOPE = 6.0
+SLOPE = 10.0
 """Lines of paper are level or upright to within this [deg]."""
 
 _FAINT = 0.25  # share of a line's length that is seen of it where it is faint,
@@ -136,7 +136,8 @@ def _slopes(y: NDArray[np.int64], x: NDArray[np.int64], width: int) -> list[floa
         rows = np.round(y - x * np.tan(np.radians(degrees))).astype(int) + width
         return float((np.bincount(rows).astype(np.float64) ** 2).sum())
 
-    best = max(np.arange(-SLOPE, SLOPE + 0.01, 0.25), key=peaky)
+    rough = max(np.arange(-SLOPE, SLOPE + 0.01, 0.5), key=peaky)
+    best = max((rough - 0.25, rough, rough + 0.25), key=peaky)
     near = sorted(np.arange(-1.5, 1.51, 0.25), key=abs)
     return [float(np.tan(np.radians(best + turn))) for turn in near]
 
