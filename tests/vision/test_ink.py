@@ -203,6 +203,16 @@ def test_lines_of_the_paper_are_erased_where_a_drawing_hides_them_or_they_are_fa
     assert ruled and np.count_nonzero(ink & ~wall) < 0.002 * wall.sum()
 
 
+@pytest.mark.parametrize("slope", [-9.0, 0.0, 4.0, 8.0])
+def test_lines_of_the_paper_may_be_tilted(slope: float) -> None:
+    wall = solid(box(200, 150, 400, 270))
+    lines = page()
+    for row in range(-120, 620, 30):
+        cv2.line(lines, (0, row), (600, round(row + 600 * np.tan(np.radians(slope)))), 1, 2)
+    ink, ruled = without_rules(wall | (lines > 0), np.where(wall, 0.8, 0.2).astype(np.float32))
+    assert ruled and np.count_nonzero(ink & ~wall) < 0.05 * lines.sum()
+
+
 def test_a_structure_that_is_larger_than_any_piece_of_the_paper_is_ink() -> None:
     sheet = np.full((500, 700, 3), 235, dtype=np.uint8)
     sheet[60:440, 90:610] = 70

@@ -87,6 +87,18 @@ def test_without_a_sheet_there_is_none() -> None:
     assert find_sheet(np.full((600, 800, 3), 230, dtype=np.uint8)) is None
 
 
+def test_a_corner_of_shadow_and_crayon_is_no_sheet() -> None:
+    photo = np.full((600, 800, 3), 235, dtype=np.uint8)
+    photo[:34] = (60, 62, 66)  # of the sheet one side is seen
+    shade = np.ones((600, 800), dtype=np.float32)
+    shade[260:, :330] = 0.45
+    grain = cv2.GaussianBlur(np.random.default_rng(0).normal(size=(600, 800)), (0, 0), 3)
+    crayon = grain < np.quantile(grain, 0.8)
+    crayon[:90] = crayon[420:] = crayon[:, :330] = crayon[:, 640:] = False
+    photo[crayon] = (225, 110, 30)
+    assert find_sheet((photo * cv2.GaussianBlur(shade, (0, 0), 20)[..., None]).astype(np.uint8)) is None
+
+
 def test_a_rectangle_seen_askew_has_its_own_proportions() -> None:
     corners = np.array([[-1.5, -1], [1.5, -1], [1.5, 1], [-1.5, 1]])
     lean, turn, focal = np.radians(35), np.radians(20), 600.0
