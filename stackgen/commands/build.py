@@ -189,21 +189,24 @@ def _from_image(image: Path, file: Path | None, wanted: Wanted, picture: Picture
     """Read a picture, write what was read, and sample stacks for it: those that stand, the best first."""
     if file is not None:
         raise StackgenError(f"give {file} or --from_image {image}, not both")
+    from stackgen.api import load
+    from stackgen.robot.candidates import NUMBER, stacks_of_picture
     from stackgen.search.scale import Cells
 
-    Cells.parse(wanted.cells)  # before anything is written
+    Cells.parse(wanted.cells)  # what is wrong is said before anything is written
+    if wanted.cells != "auto" and wanted.weights != DEFAULT:
+        raise StackgenError("--cells belongs to the search: leave out --weights")
+    model = None if wanted.weights == DEFAULT else load(wanted.weights)
     reading = read_picture(image, PAPER_GRID, **vars(picture))
     _make_folder(wanted.out)
     save_image(wanted.out / "overlay.png", reading.overlay)
-    from stackgen.api import load
-    from stackgen.robot.candidates import NUMBER, stacks_of_picture
 
     with progress_bar("stacks", NUMBER + 1) as (advance, _):
         done = iter(range(1, NUMBER + 2))
         found = stacks_of_picture(
             reading,
             image.name,
-            None if wanted.weights == DEFAULT else load(wanted.weights),
+            model,
             inventory=wanted.inventory,
             budget=wanted.budget,
             seed=wanted.seed,

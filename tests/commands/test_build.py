@@ -30,6 +30,7 @@ def stack_of(shapes: Sequence[int], poses: Sequence[Sequence[float]]) -> Stack:
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / "configs" / "robot" / "ur5.yaml"
+SKETCH = ROOT / "examples" / "photos" / "sketch-house.jpg"
 
 
 @pytest.fixture
@@ -66,6 +67,8 @@ def nothing_moves(monkeypatch: pytest.MonkeyPatch) -> None:
         (["{stacks}", "--inventory", "cube=1"], "--inventory, --budget and --cells go with --from_image"),
         (["{stacks}", "--cells", "4"], "--inventory, --budget and --cells go with --from_image"),
         (["--from_image", "a.png", "--cells", "many"], "cells 'many': give auto, a height such as 6"),
+        (["--from_image", "{sketch}", "--cells", "4", "--weights", "paper"], "--cells belongs to the search"),
+        (["--from_image", "{sketch}", "--weights", "no.ckpt"], "no.ckpt"),
         (["{stacks}", "--execute"], "say --arm ur-rtde"),
         (["{stacks}", "--arm", "ur-rtde", "--execute"], "needs the address of the arm's controller"),
         (["{stacks}", "--arm", "urscript", "--video", "a.gif"], "go with the simulated arm"),
@@ -83,7 +86,8 @@ def test_what_cannot_be_built_is_one_line_and_nothing_moves(
     options: list[object], message: str, cli: Cli, stacks: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    answer = cli("build", *(str(o).replace("{stacks}", str(stacks)) for o in options), "--out", out)
+    named = [str(o).replace("{stacks}", str(stacks)).replace("{sketch}", str(SKETCH)) for o in options]
+    answer = cli("build", *named, "--out", out)
     assert answer.code == 2
     assert message in answer.line
     assert not out.exists()
