@@ -23,10 +23,9 @@ from stackgen.errors import StackgenError
 from stackgen.geometry import silhouette
 from stackgen.io.files import write_json
 from stackgen.protocols import StabilityChecker, StackSampler
-from stackgen.sampling.alignment import AlignedSampler
+from stackgen.sampling.alignment import AlignedSampler, aligned
 from stackgen.search.sampler import NAME, side_by_side
 from stackgen.stack import Stack
-from stackgen.vision.drawings import grid_offset
 from stackgen.world import PAPER_GRID, PAPER_WORLD, Mask, World
 
 if TYPE_CHECKING:
@@ -217,8 +216,8 @@ class AlignedPredictor:
 
     def predict(self, silhouettes: Mask, top: int = 1, limit: NDArray[np.int64] | None = None) -> NDArray[np.int64]:
         """See BlockListPredictor."""
-        shifted = [np.roll(mask, grid_offset(mask, self.world.grid), axis=1) for mask in silhouettes]
-        return self.predictor.predict(np.stack(shifted), top, limit)
+        shown = [aligned(mask, self.world.grid)[0] for mask in silhouettes]
+        return self.predictor.predict(np.stack(shown), top, limit)
 
 
 @dataclass(frozen=True)

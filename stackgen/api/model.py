@@ -18,9 +18,8 @@ from stackgen.io.stacks_file import StackEntry, StacksFile, Weights
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.names import DEFAULT, CheckerName
 from stackgen.protocols import BlockListPredictor, StabilityChecker, StackSampler
-from stackgen.sampling.alignment import AlignedSampler
+from stackgen.sampling.alignment import AlignedSampler, aligned
 from stackgen.stack import Stack, check_block_list, parse_block_list
-from stackgen.vision.drawings import grid_offset
 from stackgen.vision.reader import Reading, read_silhouette
 from stackgen.world import Grid, Mask, World
 
@@ -252,14 +251,14 @@ class Model:
         mask = self.read(silhouette)
         if blocks is not None:
             return mask, self.counts(blocks)[None]
-        aligned = np.roll(mask, grid_offset(mask, self.world.grid), axis=1)
+        shown, _ = aligned(mask, self.world.grid)
         if inventory is None:
-            return mask, self.predictor.predict(aligned[None], top=top)[0]
+            return mask, self.predictor.predict(shown[None], top=top)[0]
         from stackgen.sampling.inventory import allowed_lists
 
         ranks = None if self._predictor is None else lambda: self.predictor
         try:
-            return mask, allowed_lists(aligned, self.inventory(inventory), self.world, ranks, top)
+            return mask, allowed_lists(shown, self.inventory(inventory), self.world, ranks, top)
         except StackgenError as error:
             name = f"{silhouette}: " if isinstance(silhouette, str | Path) else ""
             raise StackgenError(f"{name}{error}") from error

@@ -22,6 +22,7 @@ from stackgen.errors import StackgenError
 from stackgen.io.stacks_file import StacksFile, to_json
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.protocols import StackSampler
+from stackgen.sampling.alignment import aligned
 from stackgen.sampling.verified import Budget
 from stackgen.sampling.wrapped import WrappedSampler
 from stackgen.stack import shapes_of
@@ -29,7 +30,6 @@ from stackgen.studio.requests import GenerateRequest, ReadRequest, Wish
 from stackgen.studio.work.drawings import cells_high, mask_of, pack, picture_of, png, reading_of
 from stackgen.studio.work.judging import Message, Recorder, entry_facts, physics_of
 from stackgen.studio.work.methods import BEST, methods
-from stackgen.vision.drawings import grid_offset
 from stackgen.vision.reader import Reading, read_picture
 from stackgen.viz.scene import quaternion_poses
 from stackgen.world import PAPER_GRID, Grid, Mask
@@ -126,7 +126,7 @@ def _of_model(reading: Reading, wish: Wish, send: Send) -> tuple[StacksFile, Rec
     loaded = _loaded(wish.method, _solver(wish))
     target = reading.silhouette(loaded.world.grid)
     recorder = Recorder(loaded.physics, lambda verdict: send({"kind": "checked", "stable": verdict.stable}))
-    watched = _Watched(loaded.sampler, send, grid_offset(target, loaded.world.grid))
+    watched = _Watched(loaded.sampler, send, aligned(target, loaded.world.grid)[1])
     model = Model(watched, lambda: loaded.predictor, weights=loaded.weights, checker=recorder)
     asked: dict[str, Any] = {"num_samples": wish.number, "seed": wish.seed}
     asked["blocks"] = None if wish.blocks is None else _counts(wish.blocks)
