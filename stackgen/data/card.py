@@ -147,16 +147,14 @@ def _answering(manifest: Manifest) -> str:
     s = manifest.settings
     how = s["drawings"]
     kinds = ", ".join(in_markdown(kind) for kind, weight in how["kinds"].items() if weight)
-    share = how.get("other_lists", 0.0)
-    others = f", for {100 * share:g} % of the drawings from another block list" if share else ""
     sure = f" (of {how['sure_margin']:g} rad, where some do)" if how.get("sure_margin") else ""
     return (
         f"The program draws silhouettes as people make them, seed {manifest.seed}, of these kinds: {kinds}; "
         f"{100 * how['untidy']:g} % of them untidily. A search finds up to {how['known']} layouts for each that stand "
         f"and fit within {how['near']:g} IoU of the best; of those that survive a tilt of {how['margin']:g} rad{sure} "
-        f"up to {how['answers']} are drawn evenly{others}. Each is {_accepted(s)} "
-        f"Drawings whose best answer has an IoU below {how['least_fit']:g} are left out. `meta.json` names the kind of "
-        "the drawing, and gives the IoU of the stack with it, that of the best answer, and the margin [rad]."
+        f"up to {how['answers']} are drawn evenly. Each is {_accepted(s)} Drawings whose best answer has an IoU below "
+        f"{how['least_fit']:g} are left out. `meta.json` names the kind of the drawing, and gives the IoU of the stack "
+        "with it, that of the best answer, and the margin [rad]."
     )
 
 

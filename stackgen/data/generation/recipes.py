@@ -7,30 +7,21 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stackgen.data.dataset import TESTSET, Dataset
 from stackgen.data.generation.deconstruction import Settler, deconstruct, surely_falls
 from stackgen.data.generation.designs import Design, draw_design, realize
-from stackgen.data.generation.drawing.drawings import DESIGN, Drawing, DrawingSettings, choose, draw, finish
+from stackgen.data.generation.drawing.drawings import DESIGN, Drawing, choose, draw, finish
 from stackgen.data.generation.drawing.figures import Figure, of_blocks
 from stackgen.data.generation.pictures import Pictures
 from stackgen.data.generation.settings import GenerateSettings
 from stackgen.data.shards import Sample
 from stackgen.geometry import iou, silhouette
-from stackgen.search.solver import Answer, SearchSettings, solve
+from stackgen.search.solver import SearchSettings, solve
 from stackgen.sim.simulator import Simulator
 from stackgen.stack import Stack
 from stackgen.vision.masks import bounding_box
 from stackgen.world import Mask, World
-
-Ints = NDArray[np.int64]
-
-ALIKE = 0.5
-"""Blocks are exchanged for others of the same area to within this [square cell]."""
-
-WORSE = 0.06
-"""How much less IoU than the best of all the best answer of another block list may have."""
 
 
 def samples_of(settings: GenerateSettings, number: int, excluded: frozenset[str], simulator: Simulator) -> list[Sample]:
@@ -74,13 +65,18 @@ def drawing_samples(
     """Make the answers to one drawing: some of the good layouts that the search finds, drawn evenly; there may be none.
 
     Good is what fits within `near` of the best, before and after it has settled, and stands with `margin`; or with
-    `sure_margin`, if something does. The share `other_lists` of the drawings gets the best of some other block list.
+    `sure_margin`, if something does.
     """
     rng, how, world = _stream(settings, number), settings.drawings, settings.world
     drawing = _drawing(settings, excluded, rng)
     if drawing is None or fingerprint(drawing.silhouette) in excluded:
         return []
-    good, best = _good_answers(drawing.silhouette, world, how, rng)
+    found = solve(drawing.silhouette, world, how.known, settings=SearchSettings(effort=how.effort, near=how.near))
+    best = max((answer.iou for answer in found), default=0.0)
+    if best < how.least_fit:
+        return []
+    good = [answer for answer in found if answer.margin >= how.margin]
+    good = [answer for answer in good if answer.margin >= how.sure_margin] or good
     settler, samples = _settler(settings, simulator), []
     for place in rng.permutation(len(good)).tolist():
         settled = settler.settle_rest(settler.at_rest(good[place].stack))
@@ -98,43 +94,6 @@ def drawing_samples(
         if len(samples) == how.answers:
             break
     return samples
-
-
-def _good_answers(
-    drawn: Mask, world: World, how: DrawingSettings, rng: np.random.Generator
-) -> tuple[list[Answer], float]:
-    """Return the answers to a drawing that stand with margin, and the IoU of the best of all with the same blocks."""
-    search = SearchSettings(effort=how.effort, near=how.near)
-    found = solve(drawn, world, how.known, settings=search)
-    best = max((answer.iou for answer in found), default=0.0)
-    if best < how.least_fit:
-        return [], best
-    if how.other_lists and rng.random() < how.other_lists:
-        own = np.bincount(found[int(rng.integers(len(found)))].stack.shapes, minlength=len(world.catalogue))
-        found = solve(drawn, world, how.known, exchanged(own, world, rng), settings=search)
-        of_all, best = best, max((answer.iou for answer in found), default=0.0)
-        if best < of_all - WORSE:
-            return [], best
-    good = [answer for answer in found if answer.margin >= how.margin]
-    return [answer for answer in good if answer.margin >= how.sure_margin] or good, best
-
-
-def exchanged(block_list: Ints, world: World, rng: np.random.Generator) -> Ints:
-    """Exchange one or two blocks of a list (S,) for as many or fewer others, or more, of about the same area.
-
-    A block of at most half a cell may come or go on its own.
-    """
-    areas = np.array([shape.area for shape in world.catalogue])
-    while True:
-        changed = block_list.copy()
-        blocks = np.repeat(np.arange(len(areas)), block_list)
-        taken = rng.permutation(blocks)[: int(rng.integers(0, 3))]
-        put = rng.integers(0, len(areas), int(rng.integers(0, 3)))
-        np.subtract.at(changed, taken, 1)
-        np.add.at(changed, put, 1)
-        alike = abs(float(areas[taken].sum() - areas[put].sum())) <= ALIKE + 1e-9
-        if alike and 1 <= changed.sum() <= world.max_blocks and (changed != block_list).any():
-            return changed
 
 
 def _stream(settings: GenerateSettings, number: int) -> np.random.Generator:

@@ -16,15 +16,7 @@ from stackgen.data.generation import recipes
 from stackgen.data.generation.drawing.drawings import DESIGN, Drawing, DrawingSettings
 from stackgen.data.generation.executors import make_executor
 from stackgen.data.generation.generate import ShardTask, generate
-from stackgen.data.generation.recipes import (
-    ALIKE,
-    WORSE,
-    drawing_samples,
-    exchanged,
-    fingerprint,
-    samples_of,
-    testset_contents,
-)
+from stackgen.data.generation.recipes import drawing_samples, fingerprint, samples_of, testset_contents
 from stackgen.data.generation.repair import repair
 from stackgen.data.generation.settings import GenerateSettings
 from stackgen.data.inspection.contents import Contents, facts
@@ -131,31 +123,6 @@ def test_answers_that_hardly_stand_are_left_out_where_others_stand_surely(simula
         assert sorted(known[1]) == sorted(sure or known[0])
         mixed += 0 < len(sure) < len(known[0])
     assert mixed
-
-
-def test_an_exchanged_list_differs_and_has_about_the_same_area() -> None:
-    rng, areas = np.random.default_rng(0), np.array([shape.area for shape in PAPER_CATALOGUE])
-    own = np.array([2, 1, 0, 1])
-    seen = [exchanged(own, PAPER_WORLD, rng) for _ in range(200)]
-    assert all((other >= 0).all() and (other != own).any() and 1 <= other.sum() <= 10 for other in seen)
-    assert all(abs(float((other - own) @ areas)) <= ALIKE + 1e-9 for other in seen)
-    assert len({tuple(other) for other in seen}) > 10
-    alone = np.array([0, 0, 0, 1])
-    assert all(exchanged(alone, PAPER_WORLD, rng).sum() > 0 for _ in range(50))
-
-
-def test_other_block_lists_are_answered_nearly_as_well(simulator: Simulator) -> None:
-    drawings = DrawingSettings(kinds={DESIGN: 1}, effort=0.05, known=8, answers=8, untidy=0)
-    own = replace(DRAWN, drawings=drawings)
-    other = replace(DRAWN, drawings=replace(drawings, other_lists=1.0))
-    unlike = 0
-    for number in range(10):
-        known, found = (drawing_samples(of, number, frozenset(), simulator) for of in (own, other))
-        lists = {tuple(np.bincount(sample.shapes, minlength=4)) for sample in found}
-        assert len(lists) <= 1
-        assert all(sample.meta["best"] >= known[0].meta["best"] - WORSE - 1e-4 for sample in found)
-        unlike += bool(lists - {tuple(np.bincount(sample.shapes, minlength=4)) for sample in known})
-    assert unlike
 
 
 def test_silhouettes_and_designs_of_the_test_set_are_left_out(

@@ -45,7 +45,6 @@ class DrawingSettings:
         near: How much less IoU than the best an answer may have.
         margin: Least tilt of the ground, to either side, that an answer survives [rad].
         sure_margin: Tilt that a sure answer survives [rad]; others are left out where some are sure.
-        other_lists: Share of the drawings that are answered with a block list that is not quite a good answer's.
         least_fit: Least IoU of the best answer; drawings that blocks cannot make are left out.
 
     Raises:
@@ -63,7 +62,6 @@ class DrawingSettings:
     near: float = 0.02
     margin: float = 0.03
     sure_margin: float = 0.0
-    other_lists: float = 0.0
     least_fit: float = 0.5
 
     def __post_init__(self) -> None:
@@ -73,8 +71,8 @@ class DrawingSettings:
                 raise StackgenError(f"drawings: {name} {unknown[0]!r} is none of {', '.join(known)}")
             if any(not 0 <= weight < np.inf for weight in weights.values()) or sum(weights.values()) <= 0:
                 raise StackgenError(f"drawings: {name} needs weights of at least 0, and one above it")
-        if any(not 0 <= share <= 1 for share in (self.untidy, self.near, self.other_lists, self.least_fit)):
-            raise StackgenError("drawings: untidy, near, other_lists and least_fit lie in 0..1")
+        if not (0 <= self.untidy <= 1 and 0 <= self.near <= 1 and 0 <= self.least_fit <= 1):
+            raise StackgenError("drawings: untidy, near and least_fit lie in 0..1")
         if not (self.margin >= 0 and self.sure_margin >= 0):
             raise StackgenError("drawings: margin and sure_margin are at least 0")
         if not (0 < self.effort < np.inf and self.smallest > 0 and 1 <= self.answers <= self.known):
