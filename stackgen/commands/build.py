@@ -106,10 +106,6 @@ def main(
         real: Who builds, and what a real arm needs.
         file: File of stacks (stacks.json).
     """
-    from stackgen.robot.build import plan_stack
-    from stackgen.robot.candidates import first_buildable
-    from stackgen.sim.physics import Physics
-
     placed = _check_options(wanted, simulation, real)
     if wanted.from_image is None:
         if picture != PictureOptions():
@@ -118,7 +114,41 @@ def main(
     else:
         if real.yes:
             raise StackgenError("a real arm asks before it moves for a picture: leave out --yes")
-        content = _from_image(wanted.from_image, file, wanted, picture)
+        content = _from_image(wanted.from_image, file, wanted, picture, len(wanted.cell.staging.slots))
+    while True:
+        planned = _planned(content, wanted, placed)
+        _make_folder(wanted.out)
+        write_sheet(real, planned)
+        if real.arm != "simulation":
+            return build_for_real(planned, real, wanted.out)
+        result = _built(planned, wanted, simulation, content)
+        _write(wanted, simulation, planned, content, result)
+        _show(result)
+        fewer = len(planned.plan.stack) - 1
+        if (
+            result.success
+            or wanted.from_image is None
+            or not fewer
+            or (wanted.cells, wanted.weights) != ("auto", DEFAULT)
+        ):
+            break
+        tell(f"fewer, larger blocks are easier to build: stacks of at most {fewer} are looked for", style="yellow")
+        content = _from_image(wanted.from_image, file, wanted, picture, fewer)
+        if len(content.stacks[0]) > fewer:
+            break
+    if wanted.from_image is not None and not result.success:
+        tell("fewer, larger blocks are easier to build: give fewer --cells, such as --cells 4", style="yellow")
+    written = [wanted.out, *([simulation.video] if simulation.video else [])]
+    tell(f"wrote {' and '.join(map(str, written))}", wrote=written)
+    return 0 if result.success else 1
+
+
+def _planned(content: StacksFile, wanted: Wanted, placed: int) -> PlannedBuild:
+    """Plan the first of some stacks that can be built; say where its order is not safe."""
+    from stackgen.robot.build import plan_stack
+    from stackgen.robot.candidates import first_buildable
+    from stackgen.sim.physics import Physics
+
     physics = replace(Physics.recorded(content.physics), cell_size=content.cell_size)
     with progress_bar("plan", len(content.stacks[0])) as (advance, say):
         plan = partial(
@@ -133,16 +163,7 @@ def main(
         planned = first_buildable(content.stacks, plan)
         if not planned.design.order.safe:
             say(f"the greedy order is not safe: {planned.design.order.blocked}")
-    _make_folder(wanted.out)
-    write_sheet(real, planned)
-    if real.arm != "simulation":
-        return build_for_real(planned, real, wanted.out)
-    result = _built(planned, wanted, simulation, content)
-    _write(wanted, simulation, planned, content, result)
-    _show(result, wanted.from_image)
-    written = [wanted.out, *([simulation.video] if simulation.video else [])]
-    tell(f"wrote {' and '.join(map(str, written))}", wrote=written)
-    return 0 if result.success else 1
+    return planned
 
 
 def _check_options(wanted: Wanted, simulation: Simulation, real: RealArm) -> int:
@@ -185,8 +206,11 @@ def _make_folder(out: Path) -> None:
         raise StackgenError(f"--out {out}: cannot be made: {error.strerror or error}") from error
 
 
-def _from_image(image: Path, file: Path | None, wanted: Wanted, picture: PictureOptions) -> StacksFile:
-    """Read a picture, write what was read, and sample stacks for it: those that stand, the best first."""
+def _from_image(image: Path, file: Path | None, wanted: Wanted, picture: PictureOptions, most: int) -> StacksFile:
+    """Read a picture, write what was read, and sample stacks for it: those that stand, the best first.
+
+    Where all of them have more than `most` blocks, stacks of a smaller scale are taken, if there are such.
+    """
     if file is not None:
         raise StackgenError(f"give {file} or --from_image {image}, not both")
     from stackgen.api import load
@@ -211,7 +235,7 @@ def _from_image(image: Path, file: Path | None, wanted: Wanted, picture: Picture
             budget=wanted.budget,
             seed=wanted.seed,
             cells=wanted.cells,
-            most=len(wanted.cell.staging.slots),
+            most=most,
             on_step=lambda: advance(next(done)),
         )
     assert found.block_list is not None and found.target is not None
@@ -257,7 +281,7 @@ def _write(
     write_stacks(wanted.out / "stacks.json", replace(content, entries=(entry,), physics=physics))
 
 
-def _show(result: BuildReport, image: Path | None) -> None:
+def _show(result: BuildReport) -> None:
     """Print a row for each block, and what stands in the end."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))  # 80 columns hold it
     table.add_column("block", no_wrap=True)
@@ -287,8 +311,6 @@ def _show(result: BuildReport, image: Path | None) -> None:
         f" {result.seconds:.0f} s of the arm's time, {result.real_time_factor:.1f} times real time"
     )
     tell(Text.assemble(word, words))
-    if image is not None and not result.success:
-        tell("fewer, larger blocks are easier to build: give fewer --cells, such as --cells 4", style="yellow")
 
 
 def _what_went_wrong(result: BuildReport) -> str:

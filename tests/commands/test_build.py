@@ -17,6 +17,7 @@ import stackgen.robot.build as building
 from stackgen.commands.build import COMMAND
 from stackgen.commands.parsing import own_sections, parse
 from stackgen.io.stacks_file import StackEntry, StacksFile, read_stacks, write_stacks
+from stackgen.robot.build_report import BuildReport
 from stackgen.robot.planning.arm_model import arm_model
 from stackgen.robot.workcell import Workcell
 from stackgen.stack import Stack
@@ -166,6 +167,26 @@ def test_a_build_leaves_report_stack_picture_and_film(cli: Cli, stacks: Path, tm
     assert report["format"] == "stackgen.build/1" and report["success"] and report["unplanned_contacts"] == 0
     assert read_stacks(out / "stacks.json").stacks[0].poses[0, :2] == pytest.approx([0, 0], abs=0.02)
     assert film.read_bytes()[:4] == b"GIF8" and [path.name for path in film.parent.iterdir()] == ["film.gif"]
+
+
+@pytest.mark.slow
+def test_a_picture_whose_blocks_the_arm_knocks_over_is_built_of_fewer(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[int] = []
+
+    def easy(report: BuildReport) -> bool:
+        tried.append(len(report.blocks))
+        return len(report.blocks) < max(tried)
+
+    monkeypatch.setattr(BuildReport, "success", property(easy))
+    options = ("--from_image", ROOT / "examples" / "silhouettes" / "arch.png", "--grasp", "fixed")
+    answer = cli("build", *options, "--cell.staging.straighten", "false", "--out", tmp_path / "out")
+    said = " ".join((answer.out + answer.err).split())
+    assert answer.code == 0 and "fewer, larger blocks are easier to build" in said
+    built = json.loads((tmp_path / "out" / "build.json").read_text())
+    assert len(built["blocks"]) == tried[-1] < tried[0] == max(tried)
+    assert len(read_stacks(tmp_path / "out" / "stacks.json").stacks[0]) == tried[-1]
 
 
 def test_another_arm_builds_by_its_configuration_alone(cli: Cli, stacks: Path, tmp_path: Path) -> None:
