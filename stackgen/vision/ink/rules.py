@@ -119,7 +119,8 @@ def _between(peaks: NDArray[np.int64], share: NDArray[np.float64], near: int) ->
         where.append(low + (high - low) / parts * np.arange(1, parts))
     found = []
     for row in np.round(np.concatenate(where)).astype(int):
-        best = row - near + int(share[max(0, row - near) : row + near + 1].argmax())
+        top = max(0, row - near)
+        best = top + int(share[top : row + near + 1].argmax())
         if share[best] > 0.5:
             found.append(best)
     return found
