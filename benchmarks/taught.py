@@ -1,8 +1,8 @@
 """What teaching changes: samplers on validation scenes of both recipes, and on disturbed ones, never on testset-v1.
 
 Drawings and scenes of the paper's recipe are asked with their true block lists, disturbed scenes and the drawings of
-examples/silhouettes with the lists that the search finds, or with those of a network (`--lists`), shifted to the grid's
-cells. The search itself is a row.
+examples/silhouettes with the lists that the search finds, or with those of a network (`--lists`), at the scale and in
+the place of the grid's cells. The search itself is a row, and chooses the blocks of disturbed scenes.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from benchmarks.common import argument_parser, percent, plain_table, report, start
-from benchmarks.out_of_distribution import KINDS, METRICS, AlignedPredictor, scenes_of_kind
+from benchmarks.out_of_distribution import KINDS, METRICS, OWN_LISTS, AlignedPredictor, scenes_of_kind
 
 if TYPE_CHECKING:
     from stackgen.evaluation.protocol import Scene
@@ -66,7 +66,7 @@ def main() -> None:
             sampler = load_sampler(name)
             request = Request(name, sampler.world, sampler, num_samples=options.num_samples, seed=options.seed)
             if kind not in (DRAWN, PAPER):
-                aligned = AlignedSampler(sampler)
+                aligned = OWN_LISTS.get(name) or AlignedSampler(sampler)
                 request = Request(
                     name, sampler.world, aligned, lists, num_samples=options.num_samples, seed=options.seed
                 )

@@ -18,7 +18,7 @@ from stackgen.io.stacks_file import StackEntry, StacksFile, Weights
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.names import DEFAULT, CheckerName
 from stackgen.protocols import BlockListPredictor, StabilityChecker, StackSampler
-from stackgen.sampling.alignment import AlignedSampler, aligned
+from stackgen.sampling.alignment import AlignedSampler, as_shown
 from stackgen.stack import Stack, check_block_list, parse_block_list
 from stackgen.vision.reader import Reading, read_silhouette
 from stackgen.world import Grid, Mask, World
@@ -251,7 +251,7 @@ class Model:
         mask = self.read(silhouette)
         if blocks is not None:
             return mask, self.counts(blocks)[None]
-        shown, _ = aligned(mask, self.world.grid)
+        shown, _ = as_shown(mask, self.sampler)
         if inventory is None:
             return mask, self.predictor.predict(shown[None], top=top)[0]
         from stackgen.sampling.inventory import allowed_lists

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from stackgen.protocols import StackSampler
 from stackgen.sampling.wrapped import WrappedSampler
+from stackgen.search.sampler import NAME as SEARCH
 from stackgen.stack import Stack
 from stackgen.vision.drawings import grid_offset
 from stackgen.vision.masks import bounding_box
@@ -35,11 +36,18 @@ class AlignedSampler(WrappedSampler):
         self, silhouettes: Mask, counts: NDArray[np.int64], num_samples: int, seed: int
     ) -> list[list[Stack]]:
         """See StackSampler."""
-        grid = self.world.grid
-        shown, offsets = zip(*(aligned(mask, grid) for mask in silhouettes), strict=True)
+        shown, offsets = zip(*(as_shown(mask, self.sampler) for mask in silhouettes), strict=True)
         scenes = self.sampler.sample_batch(np.stack(shown), counts, num_samples, seed)
-        back = [np.array([-offset / grid.pixels_per_cell, 0, 0, 0, 0, 0]) for offset in offsets]
+        back = [np.array([-offset / self.world.grid.pixels_per_cell, 0, 0, 0, 0, 0]) for offset in offsets]
         return [[s.with_poses(s.poses + b) for s in stacks] for stacks, b in zip(scenes, back, strict=True)]
+
+
+def as_shown(silhouette: Mask, sampler: StackSampler) -> tuple[Mask, int]:
+    """Give what a sampler, and who predicts its block lists, are shown of a silhouette (H, W), as `aligned` does.
+
+    The search puts blocks at any pixel, and is shown the silhouette as it is.
+    """
+    return (silhouette, 0) if sampler.card.get("kind") == SEARCH else aligned(silhouette, sampler.world.grid)
 
 
 def aligned(silhouette: Mask, grid: Grid) -> tuple[Mask, int]:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
 
 from stackgen.data.dataset import TESTSET, Dataset
-from stackgen.sampling.alignment import AlignedSampler, aligned, cell_scale
+from stackgen.sampling.alignment import AlignedSampler, aligned, as_shown, cell_scale
+from stackgen.search.sampler import SearchSampler
 from stackgen.stack import Stack
 from stackgen.world import PAPER_CATALOGUE, PAPER_GRID, PAPER_WORLD, Mask
 
@@ -31,6 +35,7 @@ class Recorder:
     """A sampler that keeps what it was shown, and answers with a cube in the middle of the grid."""
 
     world = PAPER_WORLD
+    card: Mapping[str, Any] = {}
     shown: Mask
 
     def sample_batch(self, silhouettes: Mask, counts: object, num_samples: int, seed: int) -> list[list[Stack]]:
@@ -73,3 +78,9 @@ def test_a_stack_stands_where_the_structure_was_drawn() -> None:
     assert len(columns) in (14, 15)
     moved = (columns[0] + columns[-1] - (40 + 52)) / 2 / 14
     assert stack.poses[0, 0] == pytest.approx(-moved, abs=0.04)
+
+
+def test_the_search_is_shown_what_was_drawn(scenes: Mask) -> None:
+    drawn = drawn_at(scenes[0], 0.87)
+    shown, offset = as_shown(drawn, SearchSampler())
+    assert (shown == drawn).all() and offset == 0

@@ -22,7 +22,7 @@ from stackgen.errors import StackgenError
 from stackgen.io.stacks_file import StacksFile, to_json
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.protocols import StackSampler
-from stackgen.sampling.alignment import aligned
+from stackgen.sampling.alignment import as_shown
 from stackgen.sampling.verified import Budget
 from stackgen.sampling.wrapped import WrappedSampler
 from stackgen.stack import shapes_of
@@ -126,7 +126,7 @@ def _of_model(reading: Reading, wish: Wish, send: Send) -> tuple[StacksFile, Rec
     loaded = _loaded(wish.method, _solver(wish))
     target = reading.silhouette(loaded.world.grid)
     recorder = Recorder(loaded.physics, lambda verdict: send({"kind": "checked", "stable": verdict.stable}))
-    watched = _Watched(loaded.sampler, send, aligned(target, loaded.world.grid)[1])
+    watched = _Watched(loaded.sampler, send, as_shown(target, loaded.sampler)[1])
     model = Model(watched, lambda: loaded.predictor, weights=loaded.weights, checker=recorder)
     asked: dict[str, Any] = {"num_samples": wish.number, "seed": wish.seed}
     asked["blocks"] = None if wish.blocks is None else _counts(wish.blocks)
