@@ -115,27 +115,26 @@ def main(
         if real.yes:
             raise StackgenError("a real arm asks before it moves for a picture: leave out --yes")
         content = _from_image(wanted.from_image, file, wanted, picture, len(wanted.cell.staging.slots))
+    planned = _planned(content, wanted, placed)
+    _make_folder(wanted.out)
+    write_sheet(real, planned)
+    if real.arm != "simulation":
+        return build_for_real(planned, real, wanted.out)
     while True:
-        planned = _planned(content, wanted, placed)
-        _make_folder(wanted.out)
-        write_sheet(real, planned)
-        if real.arm != "simulation":
-            return build_for_real(planned, real, wanted.out)
         result = _built(planned, wanted, simulation, content)
         _write(wanted, simulation, planned, content, result)
         _show(result)
-        fewer = len(planned.plan.stack) - 1
-        if (
-            result.success
-            or wanted.from_image is None
-            or not fewer
-            or (wanted.cells, wanted.weights) != ("auto", DEFAULT)
-        ):
+        if result.success or wanted.from_image is None or (wanted.cells, wanted.weights) != ("auto", DEFAULT):
             break
-        tell(f"fewer, larger blocks are easier to build: stacks of at most {fewer} are looked for", style="yellow")
-        content = _from_image(wanted.from_image, file, wanted, picture, fewer)
-        if len(content.stacks[0]) > fewer:
+        most = len(planned.plan.stack) - 1
+        tell(f"fewer, larger blocks are easier to build: stacks of at most {most} are looked for", style="yellow")
+        try:
+            content = _from_image(wanted.from_image, file, wanted, picture, most)
+            planned = _planned(content, wanted, placed)
+        except StackgenError as error:
+            tell(str(error), style="yellow")
             break
+        write_sheet(real, planned)
     if wanted.from_image is not None and not result.success:
         tell("fewer, larger blocks are easier to build: give fewer --cells, such as --cells 4", style="yellow")
     written = [wanted.out, *([simulation.video] if simulation.video else [])]
@@ -210,6 +209,9 @@ def _from_image(image: Path, file: Path | None, wanted: Wanted, picture: Picture
     """Read a picture, write what was read, and sample stacks for it: those that stand, the best first.
 
     Where all of them have more than `most` blocks, stacks of a smaller scale are taken, if there are such.
+
+    Raises:
+        StackgenError: If nothing is read or found, or `most` is less than the slots hold and all have more blocks.
     """
     if file is not None:
         raise StackgenError(f"give {file} or --from_image {image}, not both")
@@ -238,6 +240,8 @@ def _from_image(image: Path, file: Path | None, wanted: Wanted, picture: Picture
             most=most,
             on_step=lambda: advance(next(done)),
         )
+    if len(found.stacks[0]) > most < len(wanted.cell.staging.slots):
+        raise StackgenError(f"{image.name}: no stack of at most {most} blocks was found")
     assert found.block_list is not None and found.target is not None
     save_image(wanted.out / "silhouette.png", found.target)
     lines = [f"read as a {reading.describe()}", *reading.notes]

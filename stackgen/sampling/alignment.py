@@ -82,10 +82,11 @@ def cell_scale(silhouette: Mask, grid: Grid) -> float:
     down = SCALES[:, None] * (np.arange(len(level)) - foot)
     on_lines = _on_lines(across, grid) @ upright
     share = (on_lines.max(axis=1) + _on_lines(down, grid) @ level) / (upright.sum() + level.sum())
-    high, wide = SCALES * (foot - rows.start), SCALES * (columns.stop - columns.start)
-    share[(high > grid.height * grid.pixels_per_cell + _NEAR) | (wide > grid.image_size)] = 0
-    found = int(np.lexsort((np.abs(SCALES - 1), -share))[0])
     own = share[SCALES == 1][0]
+    high, half = SCALES * (foot - rows.start), SCALES * (columns.stop - columns.start) / 2
+    room = min(middle, grid.image_size - middle)  # it is enlarged about its middle
+    share[(high > grid.height * grid.pixels_per_cell + _NEAR) | (half > room)] = 0
+    found = int(np.lexsort((np.abs(SCALES - 1), -share))[0])
     return float(SCALES[found]) if share[found] >= own + CLEARLY else 1.0
 
 

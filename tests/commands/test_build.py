@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import yaml
@@ -187,6 +188,20 @@ def test_a_picture_whose_blocks_the_arm_knocks_over_is_built_of_fewer(
     built = json.loads((tmp_path / "out" / "build.json").read_text())
     assert len(built["blocks"]) == tried[-1] < tried[0] == max(tried)
     assert len(read_stacks(tmp_path / "out" / "stacks.json").stacks[0]) == tried[-1]
+
+
+@pytest.mark.slow
+def test_a_picture_that_no_fewer_blocks_make_is_told_as_it_was_built(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(BuildReport, "success", property(lambda _: False))
+    cube = np.zeros((80, 80), dtype=np.uint8)
+    cube[20:60, 20:60] = 255
+    assert cv2.imwrite(str(tmp_path / "cube.png"), cube)
+    options = ("--from_image", tmp_path / "cube.png", "--grasp", "fixed", "--inventory", "cube=1")
+    answer = cli("build", *options, "--cell.staging.straighten", "false", "--out", tmp_path / "out")
+    assert answer.code == 1 and "no stack of at most 0 blocks was found" in " ".join((answer.out + answer.err).split())
+    assert len(json.loads((tmp_path / "out" / "build.json").read_text())["blocks"]) == 1
 
 
 def test_another_arm_builds_by_its_configuration_alone(cli: Cli, stacks: Path, tmp_path: Path) -> None:

@@ -68,6 +68,16 @@ def test_what_does_not_fit_at_another_scale_keeps_its_own() -> None:
     tower[FOOT - 56 : FOOT, 23:41] = True  # as high as the grid, and more than a cell wide
     assert cell_scale(tower, PAPER_GRID) <= 1
     assert cell_scale(np.zeros((64, 64), dtype=bool), PAPER_GRID) == 1
+    beside = np.zeros((64, 64), dtype=bool)
+    beside[FOOT - 25 : FOOT, :25] = True  # at nine tenths of its scale, and at the picture's edge
+    assert cell_scale(beside, PAPER_GRID) <= 1 and cell_scale(np.roll(beside, 20, axis=1), PAPER_GRID) > 1
+
+
+def test_what_is_higher_than_the_grid_is_not_made_smaller_for_that_alone() -> None:
+    tall = np.zeros((64, 64), dtype=bool)
+    tall[FOOT - 60 : FOOT, 18:46] = True  # two cells wide, and 4 pixels higher than the grid
+    own = cell_scale(tall[:, ::-1], PAPER_GRID)
+    assert own == cell_scale(tall, PAPER_GRID) == 1
 
 
 def test_a_stack_stands_where_the_structure_was_drawn() -> None:
