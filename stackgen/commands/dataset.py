@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
@@ -14,6 +16,7 @@ from rich.text import Text
 from stackgen.commands.output import tell, wrote
 from stackgen.commands.parsing import Command, Files, epilog
 from stackgen.commands.progress_bar import progress_bar
+from stackgen.data.arrays import StackArrays
 from stackgen.data.card import write_card
 from stackgen.data.dataset import TESTSET, Dataset, read_manifest
 from stackgen.data.generation.executors import ExecutorName
@@ -22,6 +25,7 @@ from stackgen.data.resplit import By, Resplit, resplit, split_table
 from stackgen.errors import StackgenError
 from stackgen.io.files import write_json
 from stackgen.protocols import StabilityChecker
+from stackgen.stack import Stack
 
 EASY_TO_SEND = 64 * 2**20
 """Largest compact file that is easy to send along [byte]."""
@@ -154,17 +158,23 @@ def split(
         tell(f"wrote {out}; sha256 {manifest.sha256[:12]}", wrote=[out], sha256=manifest.sha256)
 
 
-def export(folder: Path, out: Path) -> None:
+def export(folder: Path, out: Path, margin: float = 0.0) -> None:
     """Write a whole dataset as one compact file of arrays, for a machine that only trains.
 
     Args:
         folder: Folder of the dataset.
         out: File to write, ending in .npz; `--data.path` accepts it.
+        margin: Least tilt of the ground that a stack for training survives, in any direction [rad]; those that fall
+            sooner are left out. Stacks for validation and test stay.
     """
     from stackgen.data.compact import save_npz
 
+    if not 0 <= margin < math.pi / 2:
+        raise StackgenError(f"--margin must lie in 0..1.57 rad, got {margin:g}")
     dataset = Dataset.open(folder)
     splits = {name: dataset.split(name) for name in dataset.splits}
+    if margin and "train" in splits:
+        splits["train"] = _steady(splits["train"], dataset.manifest, margin)
     save_npz(out, splits, dataset.manifest)
     size = out.stat().st_size
     large = "" if size <= EASY_TO_SEND else f" (more than the {EASY_TO_SEND / 2**20:g} MiB that are easy to send along)"
@@ -177,6 +187,21 @@ def _statics(manifest: Manifest) -> StabilityChecker:
     from stackgen.sim.statics.checker import StaticsChecker  # loads a solver that nothing else needs
 
     return StaticsChecker(Physics.recorded(manifest.physics))
+
+
+def _steady(stacks: StackArrays, manifest: Manifest, margin: float) -> StackArrays:
+    """Choose the stacks that survive a tilt."""
+    checker, kept = _statics(manifest), []
+    with progress_bar("stacks", len(stacks)) as (advance, _):
+        for i, k in enumerate(stacks.lengths):
+            shapes, poses = stacks.shapes[i, :k].astype(np.int64), stacks.poses[i, :k].astype(np.float64)
+            stack = Stack(shapes, poses, manifest.world.catalogue)
+            if (checker.check(stack).margin or 0.0) >= margin:
+                kept.append(i)
+            advance(1)
+    if not kept:
+        raise StackgenError(f"--margin {margin:g}: no stack for training survives that tilt; give a smaller one")
+    return stacks.select(kept)
 
 
 def _print_facts(found: Mapping[str, Any]) -> None:
@@ -228,7 +253,8 @@ COMMANDS = {
     "export": Command(
         "dataset export",
         export,
-        "stackgen dataset export data/paper --out data/paper.npz",
+        "stackgen dataset export data/paper --out data/paper.npz\n"
+        "stackgen dataset export data/paper --margin 0.1 --out data/paper-steady.npz",
         files=_FOLDER,
         reports=True,
     ),

@@ -30,6 +30,7 @@ from stackgen.data.shards import Sample
 from stackgen.geometry import iou
 from stackgen.protocols import Verdict
 from stackgen.sim.physics import Physics
+from stackgen.sim.statics.checker import StaticsChecker
 from stackgen.stack import Stack
 from tests.conftest import Cli
 
@@ -222,6 +223,27 @@ def test_a_readme_that_is_not_ours_is_left_alone(dataset: Path, tmp_path: Path) 
 def test_export_says_how_large_the_file_is(dataset: Path, tmp_path: Path, cli: Cli) -> None:
     answer = cli("dataset", "export", dataset, "--out", tmp_path / "a.npz")
     assert answer.code == 0 and "101 stacks, 0.0 MiB" in answer.out and "more than" not in answer.out
+
+
+def test_an_export_leaves_out_what_hardly_stands(dataset: Path, tmp_path: Path, cli: Cli) -> None:
+    whole, checker = Dataset.open(dataset), StaticsChecker()
+    margins = [checker.check(sample.stack(whole.world.catalogue)).margin or 0.0 for sample in whole.samples("train")]
+    least = float(np.median(margins))
+    answer = cli("dataset", "export", dataset, "--margin", least, "--out", tmp_path / "steady.npz")
+    assert answer.code == 0, answer.err
+    steady = Dataset.open(tmp_path / "steady.npz")
+    expected = whole.split("train").select([i for i, margin in enumerate(margins) if margin >= least])
+    assert 0 < len(expected) < len(margins)
+    assert (steady.split("train").poses == expected.poses).all()
+    assert (steady.split("validation").poses == whole.split("validation").poses).all()
+
+
+@pytest.mark.parametrize(("margin", "words"), [(-0.1, "must lie in"), (1.6, "must lie in"), (1.5, "no stack")])
+def test_an_export_of_no_steady_stack_is_one_line(
+    dataset: Path, tmp_path: Path, cli: Cli, margin: float, words: str
+) -> None:
+    assert words in cli("dataset", "export", dataset, "--margin", margin, "--out", tmp_path / "a.npz").line
+    assert not (tmp_path / "a.npz").exists()
 
 
 def test_unknown_actions_are_one_line(cli: Cli) -> None:
