@@ -9,11 +9,13 @@ the file from the package, where it is written by default.
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +25,7 @@ from rich.progress import track
 from benchmarks.common import argument_parser, plain_table, report, start
 from stackgen.data.dataset import TESTSET
 from stackgen.data.generation.deconstruction import surely_falls
-from stackgen.errors import StackgenError
+from stackgen.errors import MALFORMED, StackgenError
 from stackgen.evaluation.diversity_limit import PLACEMENTS, Answers, answers, expected_diversity
 from stackgen.evaluation.intervals import Estimate, clustered_ratio
 from stackgen.evaluation.protocol import Scene, load_scenes
@@ -49,6 +51,9 @@ def parser() -> argparse.ArgumentParser:
     options.add_argument("--scenes", type=int, default=500, help="scenes, evenly spread over the test set")
     options.add_argument("--placements", type=int, default=PLACEMENTS, help="displaced placements to try of a design")
     options.add_argument("--block_list_weights", default="default", help="weights of the block-list network")
+    options.add_argument(
+        "--add_to", type=Path, metavar="FILE.json", help="earlier result for as many scenes; its lists are kept"
+    )
     options.add_argument("--workers", type=int, default=1, help="processes that search")
     return options
 
@@ -63,7 +68,8 @@ def main() -> None:
     scenes = [everything[i] for i in np.linspace(0, len(everything) - 1, number).round().astype(int)]
     predictor = load_predictor(options.block_list_weights)
     predicted = predictor.predict(np.stack([scene.silhouette for scene in scenes]), top=1)[:, 0]
-    lists = {TRUE_LIST: [scene.counts for scene in scenes], PREDICTED_LIST: list(predicted)}
+    source = f"{PREDICTED_LIST} by {predictor.card.get('name')}" if options.add_to else PREDICTED_LIST
+    lists = {TRUE_LIST: [scene.counts for scene in scenes], source: list(predicted)}
     metrics: dict[str, Any] = {
         "test_set": dataset.manifest.sha256,
         "physics": StaticsFirst().physics.to_json(),
@@ -72,11 +78,31 @@ def main() -> None:
         "block_list_weights": predictor.card.get("sha256"),
         "lists": {},
     }
+    if options.add_to:
+        metrics |= kept(options.add_to, metrics, number)
+        lists.pop(TRUE_LIST)
     for source, counts in lists.items():
         began = time.perf_counter()
         found = list(search(scenes, counts, options.placements, options.workers, source))
         metrics["lists"][source] = {**summary(scenes, counts, found), "seconds": time.perf_counter() - began}
     report("diversity_limit", metrics, tables(metrics), options.out)
+
+
+def kept(path: Path, metrics: dict[str, Any], scenes: int) -> dict[str, Any]:
+    """The lists of an earlier result, and by which weights.
+
+    Raises:
+        StackgenError: If it is about other scenes, samples, placements or physics.
+    """
+    try:
+        figures = json.loads(path.read_text())["figures"]
+        same = all(figures[name] == metrics[name] for name in ("test_set", "physics", "samples", "placements"))
+        same = same and all(len(part["scenes"]) == scenes for part in figures["lists"].values())
+    except (OSError, *MALFORMED) as error:
+        raise StackgenError(f"--add_to: {path} is no result of benchmarks.diversity_limit") from error
+    if not same:
+        raise StackgenError(f"--add_to: {path} is about other scenes, placements or physics; leave the option out")
+    return {name: figures[name] for name in ("lists", "block_list_weights")}
 
 
 class StaticsFirst(StabilityChecker):
