@@ -54,9 +54,10 @@ def keep_whole(trainer: pl.Trainer) -> None:
 
 
 class KeepOnStop(pl.Callback):
-    """Keep the state when a training is stopped by Ctrl-C or SIGTERM, and stop where it can go on from exactly.
+    """Keep the state when a training ends, also by Ctrl-C or SIGTERM, and stop where it can go on from exactly.
 
-    A training step that is under way is finished first; a second signal does not wait for it.
+    A training step that is under way is finished first; a second signal does not wait for it. ModelCheckpoint alone
+    keeps every n-th step, and loses those after the last of them.
     """
 
     def __init__(self) -> None:
@@ -93,14 +94,20 @@ class KeepOnStop(pl.Callback):
         """Keep the state as `last.ckpt`, if a whole one is there that is newer than the one kept."""
         self._restore()
         stopped = isinstance(exception, KeyboardInterrupt) and self._before
-        if stopped and not self._stepping and trainer.global_step > self._saved:
-            folders = {keeper.dirpath for keeper in _keepers(trainer) if keeper.save_last and keeper.dirpath}
-            for folder in folders:
-                trainer.save_checkpoint(Path(folder) / "last.ckpt")
+        if stopped and not self._stepping:
+            self._keep(trainer)
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Leave the signals to others again."""
+        """Leave the signals to others again, and keep the steps since the last checkpoint."""
         self._restore()
+        self._keep(trainer)
+
+    def _keep(self, trainer: pl.Trainer) -> None:
+        """Save the state as `last.ckpt`, where one is kept and it is older."""
+        if trainer.global_step > self._saved:
+            folders = {keeper.dirpath for keeper in _keepers(trainer) if keeper.save_last and keeper.dirpath}
+            for folder in sorted(map(str, folders)):
+                trainer.save_checkpoint(Path(folder) / "last.ckpt")
 
     def _restore(self) -> None:
         for number, handler in self._before.items():

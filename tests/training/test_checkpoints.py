@@ -16,6 +16,7 @@ from stackgen._lightning import pl
 from stackgen.errors import StackgenError, Terminated
 from stackgen.models.weights import last_checkpoint, load_checkpoint
 from stackgen.training import checkpoints
+from stackgen.training.callbacks import EMA, RAW_WEIGHTS
 from stackgen.training.checkpoints import KeepOnStop, WholeCheckpoints, keep_whole
 from tests.training.test_callbacks import Module, batches, trainer_for
 
@@ -67,6 +68,23 @@ def test_a_stopped_training_keeps_its_state_and_goes_on_from_it(
     trainer = trainer_for(tmp_path, [], max_epochs=3)
     trainer.fit(resumed, batches(4), batches(2), ckpt_path=str(tmp_path / "last.ckpt"), weights_only=True)
     assert trainer.global_step == 12 == float(resumed.weight[0])
+
+
+@pytest.mark.parametrize("averaged", [False, True])
+def test_the_last_steps_are_kept(tmp_path: Path, averaged: bool) -> None:
+    """Ten steps, of which a checkpoint is due at the eighth."""
+    keeps = ModelCheckpoint(tmp_path, save_last=True, save_top_k=0, every_n_train_steps=8)
+    averages = [EMA(decay=0.5, warmup=False)] if averaged else []
+    trainer = trainer_for(
+        tmp_path, [*averages, keeps, KeepOnStop()], max_epochs=3, max_steps=10, enable_checkpointing=True
+    )
+    keep_whole(trainer)
+    module = Module()
+    trainer.fit(module, batches(4), batches(2))
+    content = load_checkpoint(tmp_path / "last.ckpt")
+    assert content["global_step"] == 10
+    assert float(content["state_dict"]["weight"][0]) == float(module.weight[0])  # the average, where there is one
+    assert not averaged or float(content[RAW_WEIGHTS]["weight"][0]) == 10 > float(module.weight[0])
 
 
 def test_a_checkpoint_is_never_half_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,6 +15,7 @@ BEST = "best"
 
 _TITLES = {
     "taught-verdicts": "Diffusion, taught by the search",
+    "taught-small": "Diffusion, taught, without verdicts",
     "ddpm-verdicts": "Diffusion, with verdicts",
     "ddpm-small": "Diffusion, without verdicts",
     "ddpm-paper-small": "Diffusion, the paper's recipe",
