@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
@@ -172,10 +174,11 @@ def export(folder: Path, out: Path, margin: float = 0.0) -> None:
     if not 0 <= margin < math.pi / 2:
         raise StackgenError(f"--margin must lie in 0..1.57 rad, got {margin:g}")
     dataset = Dataset.open(folder)
-    splits = {name: dataset.split(name) for name in dataset.splits}
+    splits, manifest = {name: dataset.split(name) for name in dataset.splits}, dataset.manifest
     if margin and "train" in splits:
-        splits["train"] = _steady(splits["train"], dataset.manifest, margin)
-    save_npz(out, splits, dataset.manifest)
+        kept = _steady(splits["train"], manifest, margin)
+        splits["train"], manifest = splits["train"].select(kept), _of_the_steady(manifest, kept, margin)
+    save_npz(out, splits, manifest)
     size = out.stat().st_size
     large = "" if size <= EASY_TO_SEND else f" (more than the {EASY_TO_SEND / 2**20:g} MiB that are easy to send along)"
     stacks = sum(map(len, splits.values()))
@@ -189,8 +192,8 @@ def _statics(manifest: Manifest) -> StabilityChecker:
     return StaticsChecker(Physics.recorded(manifest.physics))
 
 
-def _steady(stacks: StackArrays, manifest: Manifest, margin: float) -> StackArrays:
-    """Choose the stacks that survive a tilt."""
+def _steady(stacks: StackArrays, manifest: Manifest, margin: float) -> NDArray[np.intp]:
+    """Find the stacks that survive a tilt."""
     checker, kept = _statics(manifest), []
     with progress_bar("stacks", len(stacks)) as (advance, _):
         for i, k in enumerate(stacks.lengths):
@@ -201,7 +204,17 @@ def _steady(stacks: StackArrays, manifest: Manifest, margin: float) -> StackArra
             advance(1)
     if not kept:
         raise StackgenError(f"--margin {margin:g}: no stack for training survives that tilt; give a smaller one")
-    return stacks.select(kept)
+    return np.array(kept)
+
+
+def _of_the_steady(manifest: Manifest, kept: NDArray[np.intp], margin: float) -> Manifest:
+    """Let a manifest say which stacks for training are left of its shards, and why."""
+    shards = [shard for shard in manifest.shards if shard["split"] == "train"]
+    ends = np.cumsum([shard["samples"] for shard in shards])
+    left = np.bincount(np.searchsorted(ends, kept, side="right"), minlength=len(shards)).tolist()
+    numbers = dict(zip((shard["file"] for shard in shards), left, strict=True))
+    entries = tuple({**shard, "samples": numbers.get(shard["file"], shard["samples"])} for shard in manifest.shards)
+    return replace(manifest, shards=entries, settings={**manifest.settings, "least_margin": margin})
 
 
 def _print_facts(found: Mapping[str, Any]) -> None:

@@ -236,6 +236,8 @@ def test_an_export_leaves_out_what_hardly_stands(dataset: Path, tmp_path: Path, 
     assert 0 < len(expected) < len(margins)
     assert (steady.split("train").poses == expected.poses).all()
     assert (steady.split("validation").poses == whole.split("validation").poses).all()
+    assert steady.manifest.counts == {**whole.manifest.counts, "train": len(expected)}
+    assert steady.manifest.sha256 != whole.manifest.sha256
 
 
 @pytest.mark.parametrize(("margin", "words"), [(-0.1, "must lie in"), (1.6, "must lie in"), (1.5, "no stack")])
