@@ -46,10 +46,13 @@ _OPTIONS: dict[str, bool | int | float | str] = {
 
 def has_solution(solver: highspy.Highs, certain: bool = False) -> bool:
     """Solve, and tell whether there is a solution; where one is `certain`, another answer is not believed at once."""
+    believed = _ANSWERS[:1] if certain else _ANSWERS
     solver.run()
-    if solver.getModelStatus() not in (_ANSWERS[:1] if certain else _ANSWERS):
-        solver.clearSolver()  # rounding got in the way: start afresh, with all that HiGHS has against it
-        for option, choice in _CAREFUL.items():
+    for options in (_CAREFUL, _INTERIOR):
+        if solver.getModelStatus() in believed:
+            break
+        solver.clearSolver()  # rounding got in the way: start afresh
+        for option, choice in options.items():
             solver.setOptionValue(option, choice)
         solver.run()
     return bool(solver.getModelStatus() == _STATUS.kOptimal)
@@ -57,8 +60,10 @@ def has_solution(solver: highspy.Highs, certain: bool = False) -> bool:
 
 _STATUS = highspy.HighsModelStatus
 _ANSWERS = (_STATUS.kOptimal, _STATUS.kInfeasible, _STATUS.kUnbounded, _STATUS.kUnboundedOrInfeasible)
+# With all that HiGHS has against rounding; then by interior points, where the simplex method ends without an answer.
 _CAREFUL: dict[str, bool | int | float | str] = {
     "presolve": "on",
     "simplex_scale_strategy": 2,
     "dual_simplex_cost_perturbation_multiplier": 1.0,
 }
+_INTERIOR: dict[str, bool | int | float | str] = {"solver": "ipm"}

@@ -183,6 +183,32 @@ def same(a: Stack, b: Stack, order: NDArray[np.int64] | None = None) -> None:
         assert one.unheld[order].tolist() == two.unheld.tolist()
 
 
+def test_rounding_that_ends_the_simplex_method_does_not_end_the_check() -> None:
+    """Of this heap HiGHS's simplex method gave no answer, though the least of missing forces always exists."""
+    places = [  # x, y, z, rotation vector
+        [-1.4081401824951172, 3.0419323593378067e-07, 0.5150672197341919],
+        [0.06115077808499336, -2.1237065084278584e-06, 2.491425037384033],
+        [-0.5078850984573364, -2.7160276658833027e-06, 2.4847562313079834],
+        [0.5109880566596985, -1.5322002582252026e-06, 2.5035955905914307],
+        [-0.009825579822063446, -1.225154846906662e-06, 2.423994541168213],
+        [0.49639981985092163, 1.653679646551609e-06, 3.5007050037384033],
+        [-0.4648441672325134, -2.368760760873556e-06, 1.2321089506149292],
+    ]
+    turns = [
+        [-2.3050233721733093e-08, 3.8735379348509014e-07, 3.7665995478164405e-07],
+        [1.046690158545971e-06, -2.0349435203570465e-07, 2.17276465264149e-07],
+        [1.7600541468709707e-06, -5.636531454911164e-07, -2.375552838884687e-07],
+        [7.59464455768466e-07, 7.268226909218356e-07, 4.654091867450916e-07],
+        [1.0083895176649094e-06, 7.713322816016444e-07, 6.258906068978831e-07],
+        [-1.1172378435730934e-06, 1.0932147915809765e-06, 7.432398092532821e-07],
+        [1.3441458577290177e-06, -3.021235954747681e-07, -6.856826217926937e-08],
+    ]
+    heap = Stack(np.array([0, 0, 0, 0, 1, 2, 2]), np.hstack([places, turns]))
+    answer = StaticsChecker().answer(heap)
+    assert not answer.stable and answer.unheld.tolist() == [False, *[True] * 6]
+    assert answer.residual == pytest.approx(6.234, abs=0.01)
+
+
 def test_symmetries_do_not_change_the_verdict() -> None:
     rng = np.random.default_rng(0)
     verdicts = set()
