@@ -54,6 +54,7 @@ VERBS: dict[str, Verb] = {
     "prefer": Verb("stackgen.commands.prefer", "pair failures of a model with stacks that stand, to fine-tune it"),
     "report": Verb("stackgen.commands.report", "make the paper's table with every row, and its plots"),
     "export": Verb("stackgen.commands.export", "turn a training checkpoint into weights with a card"),
+    "mix": Verb("stackgen.commands.mix", "add up weights of one architecture, each with its share"),
     "completion": Verb("stackgen.commands.completion", "print a script that completes this command line in a shell"),
 }
 

@@ -140,15 +140,24 @@ def export_checkpoint(
     Raises:
         StackgenError: If the checkpoint is not ours, or `out` is not a `.safetensors` path.
     """
-    if out.suffix != ".safetensors":
-        raise StackgenError(f"weights are exported to a .safetensors file, not {out.name}")
     tensors, card = _read_checkpoint(checkpoint)
     if metrics:
         card["metrics"] = metrics
+    export_weights(tensors, card, out, half=half)
+    return card
+
+
+def export_weights(tensors: dict[str, Tensor], card: dict[str, Any], out: Path, half: bool = False) -> None:
+    """Write weights as :func:`export_checkpoint` does.
+
+    Raises:
+        StackgenError: If `out` is not a `.safetensors` path.
+    """
+    if out.suffix != ".safetensors":
+        raise StackgenError(f"weights are exported to a .safetensors file, not {out.name}")
     if half:  # vectors, schedules among them, are small and may need every digit
         tensors = {k: v.half() if v.is_floating_point() and v.ndim > 1 else v for k, v in tensors.items()}
     write_weights(out, tensors, card)
-    return card
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from stackgen.errors import StackgenError
 from stackgen.models.diffusion.denoiser import Denoiser
 from stackgen.models.diffusion.schedules import Schedule, ScheduleConfig
 from stackgen.models.diffusion.settings import SamplerConfig
-from stackgen.models.diffusion.solvers import Predict, ancestral, multistep
+from stackgen.models.diffusion.solvers import Predict, ancestral, multistep, standard_normal
 from stackgen.models.poses import POSE, PoseNetwork, raster_order
 from stackgen.models.transformer import TransformerConfig
 from stackgen.world import World
@@ -37,6 +37,8 @@ class DiffusionConfig:
         drop_silhouette: Share of the training samples that are shown an empty picture, so that classifier-free
             guidance is possible (Ho & Salimans 2022).
         guidance: Weight of classifier-free guidance while sampling; 1 is none. It needs `drop_silhouette`.
+        antithetic: Whether the samples of one silhouette are drawn apart; see SamplerConfig.
+        temperature: Factor of the noise that `ddpm` adds where only places are left to decide; see SamplerConfig.
 
     Raises:
         StackgenError: If a number is out of its range.
@@ -48,12 +50,16 @@ class DiffusionConfig:
     variance: Literal["beta", "posterior"] = "beta"
     drop_silhouette: float = 0.0
     guidance: float = 1.0
+    antithetic: bool = False
+    temperature: float = 1.0
 
     def __post_init__(self) -> None:
         if not 0 <= self.drop_silhouette < 1:
             raise StackgenError(f"diffusion.drop_silhouette must lie in [0, 1), got {self.drop_silhouette}")
         if self.guidance != 1 and not self.drop_silhouette:
             raise StackgenError("diffusion.guidance needs diffusion.drop_silhouette, such as 0.1")
+        if not 0 <= self.temperature <= 10:
+            raise StackgenError(f"diffusion.temperature must lie in 0..10, got {self.temperature}")
 
 
 class PoseDiffusion(PoseNetwork):
@@ -168,15 +174,17 @@ class PoseDiffusion(PoseNetwork):
             predict = self._guided(predict, self._predictor(torch.zeros_like(silhouettes), shapes, mask), config)
         if watch is not None:
             predict = self._watched(predict, watch)
-        noise = torch.randn((*shapes.shape, POSE), generator=generator, device=generator.device).to(shapes.device)
+        apart = len(shapes) // len(silhouettes) if config.antithetic else 1
+        noise = standard_normal((*shapes.shape, POSE), generator, apart).to(shapes.device)
         assert config.steps and config.spacing
         steps = self.schedule.subset(config.steps, config.spacing)
         if config.kind == "ddpm":
             posterior = config.variance == "posterior"
-            x = ancestral(predict, noise, self.schedule, generator, steps, posterior)
+            temperature = 1.0 if config.temperature is None else config.temperature
+            x = ancestral(predict, noise, self.schedule, generator, steps, posterior, apart, temperature)
         else:
             order, eta = 2 if config.kind == "dpm" else 1, config.eta or 0.0
-            x = multistep(predict, noise, self.schedule, generator, steps, order, eta)
+            x = multistep(predict, noise, self.schedule, generator, steps, order, eta, apart)
         return x * self.std + self.mean
 
     def complete(self, sampler: SamplerConfig) -> SamplerConfig:
@@ -186,7 +194,8 @@ class PoseDiffusion(PoseNetwork):
             StackgenError: If they do not fit the model.
         """
         own = self.config.guidance if self.config.drop_silhouette else None
-        return sampler.complete(self.schedule.steps, self.config.variance, own)
+        config = self.config
+        return sampler.complete(self.schedule.steps, config.variance, own, config.antithetic, config.temperature)
 
     def _predictor(self, silhouettes: Tensor, shapes: Tensor, mask: Tensor) -> Predict:
         """Make the function that estimates the clean poses of some scenes; it reads their silhouettes once."""

@@ -12,7 +12,7 @@ SamplerKind = Literal["ddpm", "ddim", "dpm"]
 SPACING = 1.3
 """Default of `SamplerConfig.spacing`: best for 4 to 8 steps on validation scenes, see docs/sampling.md."""
 
-_OF_KIND = {"ddpm": "variance", "ddim": "eta", "dpm": "eta"}
+_OF_KIND = {"ddpm": ("variance", "temperature"), "ddim": ("eta",), "dpm": ("eta",)}
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,10 @@ class SamplerConfig:
         guidance: Weight of classifier-free guidance (Ho & Salimans 2022), for a model that was trained with
             `drop_silhouette`: 1 is none, 0 leaves the silhouette out.
         guided: Range of t in which guidance acts, as two shares of T.
+        antithetic: Whether the samples that are drawn together for one silhouette are drawn apart: their noise is
+            negatively correlated. Each alone is distributed as before; together they differ more often.
+        temperature: Factor of the noise that `ddpm` adds in the lower half of the steps, where layouts are decided and
+            only places are left: below 1 blocks lie closer to where the model expects them.
 
     Raises:
         StackgenError: If a number is out of its range.
@@ -42,6 +46,8 @@ class SamplerConfig:
     variance: Literal["beta", "posterior"] | None = None
     guidance: float | None = None
     guided: tuple[float, float] | None = None
+    antithetic: bool | None = None
+    temperature: float | None = None
 
     def __post_init__(self) -> None:
         if self.guided is not None:
@@ -52,6 +58,8 @@ class SamplerConfig:
             raise StackgenError(f"sampler.spacing must lie in 1..10, got {self.spacing}")
         if self.eta is not None and not 0 <= self.eta <= 1:
             raise StackgenError(f"sampler.eta must lie in 0..1, got {self.eta}")
+        if self.temperature is not None and not 0 <= self.temperature <= 10:
+            raise StackgenError(f"sampler.temperature must lie in 0..10, got {self.temperature}")
         if self.guidance is not None and not 0 <= self.guidance <= 100:
             raise StackgenError(f"sampler.guidance must lie in 0..100, got {self.guidance}")
         if self.guided is not None and not 0 <= self.guided[0] < self.guided[1] <= 1:
@@ -65,28 +73,38 @@ class SamplerConfig:
         SamplerConfig(kind='ddim', steps=8, spacing=None, eta=None, variance=None, ...)
         """
         if self.kind not in (None, base.kind):
-            base = replace(base, eta=None, variance=None)
+            base = replace(base, eta=None, variance=None, temperature=None)
         return SamplerConfig(**{**asdict(base), **self.given()})
 
     def complete(
-        self, steps: int, variance: Literal["beta", "posterior"], guidance: float | None = None
+        self,
+        steps: int,
+        variance: Literal["beta", "posterior"],
+        guidance: float | None = None,
+        antithetic: bool = False,
+        temperature: float = 1.0,
     ) -> SamplerConfig:
-        """Fill in all that matters: a model's T, its `variance`, and its `guidance` (null if it has none).
+        """Fill in all that matters: a model's T and its own settings; `guidance` is null if it has none.
 
         Raises:
             StackgenError: If a setting belongs to another kind, or there are more steps than T.
         """
         kind = self.kind or "ddpm"
-        for name in {"eta", "variance"} - {_OF_KIND[kind]}:
-            if getattr(self, name) is not None:
-                raise StackgenError(f"sampler.{name} is not for {kind}; set {_OF_KIND[kind]}, or choose another kind")
+        for name in ("eta", "variance", "temperature"):
+            if getattr(self, name) is not None and name not in _OF_KIND[kind]:
+                own = " or ".join(_OF_KIND[kind])
+                raise StackgenError(f"sampler.{name} is not for {kind}; set {own}, or choose another kind")
         if self.steps is not None and self.steps > steps:
             raise StackgenError(f"sampler.steps: this model has {steps} steps, not {self.steps}")
         if guidance is None and (self.guidance is not None or self.guided is not None):
             raise StackgenError(
                 "sampler.guidance and sampler.guided need a model trained with diffusion.drop_silhouette"
             )
-        defaults = SamplerConfig(kind, steps, SPACING, **({"variance": variance} if kind == "ddpm" else {"eta": 0.0}))
+        defaults = SamplerConfig(kind, steps, SPACING, antithetic=antithetic or None)
+        if kind == "ddpm":
+            defaults = replace(defaults, variance=variance, temperature=temperature if temperature != 1 else None)
+        else:
+            defaults = replace(defaults, eta=0.0)
         if guidance is not None:
             defaults = replace(defaults, guidance=guidance, guided=(0.0, 1.0))
         return replace(defaults, **self.given())

@@ -23,6 +23,8 @@ def ancestral(
     generator: torch.Generator,
     steps: Sequence[int] | None = None,
     posterior_variance: bool = False,
+    apart: int = 1,
+    temperature: float = 1.0,
 ) -> Tensor:
     """Run DDPM's reverse process (paper, Eq. 3), without noise at the last step.
 
@@ -39,6 +41,9 @@ def ancestral(
         posterior_variance: Whether the noise on the way has the variance of q(x_s | x_t, x_0) instead of the
             larger sigma_t^2 = beta_t (paper). In few steps the latter leaves more noise in x_1 than the last
             step takes away: a standard deviation of 0.06 in 50 steps.
+        apart: See `standard_normal`.
+        temperature: Factor of the noise on the way in the lower half of the T steps, where the layout is decided and
+            only places are.
     """
     x = noise
     for t, s in _pairs(steps or range(schedule.steps, 0, -1)):
@@ -49,7 +54,8 @@ def ancestral(
         x = (bar_after**0.5 * beta * clean + alpha**0.5 * (1 - bar_after) * x) / (1 - bar)
         if s > 0:
             variance = beta * (1 - bar_after) / (1 - bar) if posterior_variance else beta
-            x = x + variance**0.5 * _fresh(x, generator)
+            factor = temperature if 2 * s < schedule.steps else 1.0
+            x = x + factor * variance**0.5 * _fresh(x, generator, apart)
     return x
 
 
@@ -61,6 +67,7 @@ def multistep(
     steps: Sequence[int] | None = None,
     order: int = 1,
     eta: float = 0.0,
+    apart: int = 1,
 ) -> Tensor:
     """Run DDIM (order 1) or DPM-Solver++ (2M) with data prediction (order 2), with or without fresh noise.
 
@@ -83,6 +90,7 @@ def multistep(
         steps: Steps to take, falling from T; all by default.
         order: Order of the solver, 1 or 2.
         eta: Share of fresh noise, 0..1.
+        apart: See `standard_normal`.
     """
     x, before = noise, None
     for t, s in _pairs(steps or range(schedule.steps, 0, -1)):
@@ -98,7 +106,7 @@ def multistep(
         noise_in_x = (x - bar**0.5 * target) / (1 - bar) ** 0.5
         x = bar_after**0.5 * target + max(0.0, 1 - bar_after - variance) ** 0.5 * noise_in_x
         if variance > 0:
-            x = x + variance**0.5 * _fresh(x, generator)
+            x = x + variance**0.5 * _fresh(x, generator, apart)
     return x
 
 
@@ -107,5 +115,27 @@ def _pairs(steps: Sequence[int]) -> Iterator[tuple[int, int]]:
     return zip(steps, [*steps[1:], 0], strict=True)
 
 
-def _fresh(x: Tensor, generator: torch.Generator) -> Tensor:
-    return torch.randn(x.shape, generator=generator, device=generator.device, dtype=x.dtype).to(x.device)
+def _fresh(x: Tensor, generator: torch.Generator, apart: int) -> Tensor:
+    return standard_normal(x.shape, generator, apart, x.dtype).to(x.device)
+
+
+def standard_normal(
+    shape: Sequence[int], generator: torch.Generator, apart: int = 1, dtype: torch.dtype | None = None
+) -> Tensor:
+    """Draw a sample of N(0, I), each `apart` rows in a row of which are antithetic.
+
+    Such rows are taken from their mean and lengthened, so each of them alone is a sample of N(0, I), and any two have a
+    correlation of -1 / (apart - 1), the least that so many can have; two are opposites (Hammersley & Morton 1956).
+    Samples that grow from such noise are distributed as others, and differ from each other more often.
+
+    Args:
+        shape: (B, ...) of the result; `apart` divides B.
+        generator: Source of the noise.
+        apart: Number of rows that belong together; 1 makes all independent.
+        dtype: Type of the result.
+    """
+    noise = torch.randn(tuple(shape), generator=generator, device=generator.device, dtype=dtype)
+    if apart == 1:
+        return noise
+    groups = noise.unflatten(0, (-1, apart))
+    return ((groups - groups.mean(dim=1, keepdim=True)) * (apart / (apart - 1)) ** 0.5).flatten(0, 1)

@@ -250,6 +250,8 @@ SETTINGS = [
     SamplerConfig("ddim", 5, spacing=2.0, eta=1.0),
     SamplerConfig("dpm", 8),
     SamplerConfig("dpm", 1),
+    SamplerConfig(antithetic=True),
+    SamplerConfig("dpm", 6, eta=0.5, antithetic=True),
 ]
 
 
@@ -286,6 +288,23 @@ def test_what_the_card_says_of_sampling_holds_unless_overridden() -> None:
     assert sampler.configured(SamplerConfig("ddpm")).sampler == SamplerConfig("ddpm", 8, SPACING, variance="beta")
     with pytest.raises(StackgenError, match="weights card"):
         DiffusionSampler(model, PAPER_WORLD, card={"sampler": {"colour": "red"}})
+
+
+def test_samples_are_drawn_apart_where_model_or_setting_says_so(arrays: StackArrays) -> None:
+    own, model = model_for("v", TINY_CROSS), model_for("v", TINY_CROSS)
+    model.config = replace(model.config, antithetic=True)
+    apart, alone = DiffusionSampler(model, PAPER_WORLD), DiffusionSampler(own, PAPER_WORLD)
+    assert apart.settings["antithetic"] is True and "antithetic" not in alone.settings
+
+    def poses(sampler: DiffusionSampler, number: int) -> np.ndarray:
+        scenes = sampler.sample_batch(arrays.images([0, 1]), arrays.counts[:2], number, 0)
+        return np.concatenate([stack.poses for scene in scenes for stack in scene])
+
+    asked = alone.configured(SamplerConfig(antithetic=True))
+    refused = apart.configured(SamplerConfig(antithetic=False))
+    assert (poses(apart, 3) == poses(asked, 3)).all() and (poses(refused, 3) == poses(alone, 3)).all()
+    assert (poses(apart, 3) != poses(alone, 3)).any()
+    assert (poses(apart, 1) == poses(alone, 1)).all()  # one sample has none to be apart from
 
 
 @pytest.mark.parametrize(

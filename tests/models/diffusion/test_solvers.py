@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from stackgen.models.diffusion.schedules import Schedule, ScheduleConfig
-from stackgen.models.diffusion.solvers import Predict, ancestral, multistep
+from stackgen.models.diffusion.solvers import Predict, ancestral, multistep, standard_normal
 
 SCHEDULE = Schedule(ScheduleConfig())
 LONG = Schedule(ScheduleConfig(steps=400, beta_end=0.04))
@@ -197,3 +197,33 @@ def test_all_steps_are_those_of_the_schedule() -> None:
     for solve in SOLVERS.values():
         a, b = (solve(wavy, start(2, 2, 6), SCHEDULE, generator(), steps) for steps in (None, whole))
         assert (a == b).all()
+
+
+@pytest.mark.parametrize("apart", [2, 3, 8])
+def test_antithetic_noise_is_standard_normal_and_correlated_as_little_as_can_be(apart: int) -> None:
+    groups = standard_normal((apart * 40_000, 2), generator(), apart).unflatten(0, (-1, apart))
+    wanted = torch.full((apart, apart), -1 / (apart - 1)).fill_diagonal_(1.0)
+    for entry in range(2):
+        torch.testing.assert_close(groups[..., entry].T.cov(), wanted, atol=0.02, rtol=0)
+    assert groups.mean(dim=(0, 2)).abs().max() < 0.02
+    assert groups.sum(dim=1).abs().max() < 1e-4
+    fourth = (groups**4).mean().item()
+    assert fourth == pytest.approx(3, rel=0.03)  # that of a Gaussian
+    first, second = groups[:-1, 0], groups[1:, 0]
+    assert (first * second).mean().abs() < 0.02  # groups know nothing of each other
+
+
+def test_noise_without_groups_is_what_it_was() -> None:
+    noise = standard_normal((4, 3, 6), generator(3))
+    assert torch.equal(noise, torch.randn(4, 3, 6, generator=generator(3)))
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_antithetic_samples_of_gaussian_data_have_the_moments_and_lie_apart(solver: str) -> None:
+    """The estimate is linear in x, so samples are as correlated as their noise."""
+    noise = standard_normal((6000, 1, 6), generator(1), 3)
+    x = SOLVERS[solver](gaussian(LONG, 0.7, 0.6), noise, LONG, generator(), apart=3)
+    assert x.mean().item() == pytest.approx(0.7, abs=0.03)
+    assert x.std().item() == pytest.approx(0.6, rel=0.1)
+    groups = x.unflatten(0, (-1, 3)) - 0.7
+    assert ((groups[:, 0] * groups[:, 1]).mean() / x.var()).item() == pytest.approx(-0.5, abs=0.05)
