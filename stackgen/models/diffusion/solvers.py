@@ -42,8 +42,8 @@ def ancestral(
             larger sigma_t^2 = beta_t (paper). In few steps the latter leaves more noise in x_1 than the last
             step takes away: a standard deviation of 0.06 in 50 steps.
         apart: See `standard_normal`.
-        temperature: Factor of the noise on the way in the lower half of the T steps, where the layout is decided and
-            only places are.
+        temperature: Factor of the noise on the way in the lower half of the T steps, where the layout is decided
+            and only places are left.
     """
     x = noise
     for t, s in _pairs(steps or range(schedule.steps, 0, -1)):
