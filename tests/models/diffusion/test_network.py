@@ -315,6 +315,8 @@ def test_samples_are_drawn_apart_where_model_or_setting_says_so(arrays: StackArr
         ({"eta": 0.5}, "eta is not for ddpm"),
         ({"kind": "dpm", "variance": "beta"}, "variance is not for dpm"),
         ({"kind": "dpm", "eta": 1.5}, "0..1"),
+        ({"kind": "dpm", "temperature": 0.5}, "temperature is not for dpm; set eta"),
+        ({"temperature": -0.1}, "0..10"),
         ({"spacing": 0.5}, "1..10"),
         ({"guidance": 2.0}, "sampler.guidance"),
         ({"guidance": -1.0}, "must lie in"),

@@ -227,3 +227,17 @@ def test_antithetic_samples_of_gaussian_data_have_the_moments_and_lie_apart(solv
     assert x.std().item() == pytest.approx(0.6, rel=0.1)
     groups = x.unflatten(0, (-1, 3)) - 0.7
     assert ((groups[:, 0] * groups[:, 1]).mean() / x.var()).item() == pytest.approx(-0.5, abs=0.05)
+
+
+def test_temperature_acts_in_the_lower_half_of_the_steps_alone() -> None:
+    noise, seen, cold = start(2, 2, 6), dict[int, Tensor](), dict[int, Tensor]()
+    ancestral(watched(wavy, seen), noise, SCHEDULE, generator(4))
+    ancestral(watched(wavy, cold), noise, SCHEDULE, generator(4), temperature=0.3)
+    same = [t for t in seen if torch.equal(seen[t], cold[t])]
+    assert same == list(range(50, 24, -1))  # the noise of the step from 25 to 24 is the first that is less
+
+
+def test_low_temperature_brings_samples_nearer_to_the_mean() -> None:
+    predict, noise = gaussian(SCHEDULE, 0.7, 0.05), start(2000, 1, 6)
+    spread = [ancestral(predict, noise, SCHEDULE, generator(), None, True, 1, t).std().item() for t in (0.0, 0.5, 1.0)]
+    assert spread == sorted(spread) and spread[0] < 0.9 * spread[2]
