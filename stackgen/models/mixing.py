@@ -19,6 +19,8 @@ from stackgen.errors import StackgenError
 from stackgen.models.weights import read_weights
 
 _WORLD = ("kind", "catalogue", "grid", "max_blocks")
+_FREE = ("dropout", "variance", "guidance", "antithetic", "temperature")
+"""What the configurations may differ in: it changes how weights are trained or sampled, not what they mean."""
 
 
 def mix_weights(
@@ -44,7 +46,7 @@ def mix_weights(
     parts = [read_weights(source) for source in sources]
     tensors, card = parts[0]
     for source, (others, its_card) in zip(sources[1:], parts[1:], strict=True):
-        same = all(its_card.get(name) == card.get(name) for name in _WORLD)
+        same = all(its_card.get(name) == card.get(name) for name in _WORLD) and _agree(its_card, card, "config")
         if not same or {k: v.shape for k, v in others.items()} != {k: v.shape for k, v in tensors.items()}:
             raise StackgenError(f"{source} is not of the same architecture and world as {sources[0]}")
     mixed = {name: _sum([part[name] for part, _ in parts], shares) for name in tensors}
@@ -54,6 +56,14 @@ def mix_weights(
         for source, share, (_, its) in zip(sources, shares, parts, strict=True)
     ]
     return mixed, {**facts, "mixed": named}
+
+
+def _agree(one: Any, other: Any, *names: str) -> bool:
+    """Compare two configurations where both say something; an older one may lack what has been added since."""
+    if isinstance(one, dict) and isinstance(other, dict):
+        shared = names or (one.keys() & other.keys()) - set(_FREE)
+        return all(_agree(one.get(name), other.get(name)) for name in shared)
+    return bool(one == other)
 
 
 def _sum(tensors: Sequence[Tensor], shares: Sequence[float]) -> Tensor:

@@ -76,6 +76,24 @@ def test_weights_of_another_architecture_are_refused(tiny: TinyWeights, pair: tu
         mix_weights([tiny.sampler, tiny.predictor])
 
 
+@pytest.mark.parametrize(("part", "change"), [("diffusion", {"prediction": "v"}), ("denoiser", {"heads": 1})])
+def test_equal_sizes_do_not_make_an_architecture(pair: tuple[Path, Path], part: str, change: dict[str, Any]) -> None:
+    tensors, card = read_weights(pair[1])
+    assert all(card["config"][part][name] != value for name, value in change.items())
+    config = {**card["config"], part: {**card["config"][part], **change}}
+    write_weights(pair[1], tensors, {**card, "config": config})
+    with pytest.raises(StackgenError, match="is not of the same"):
+        mix_weights(pair)
+
+
+def test_how_weights_are_sampled_may_differ_and_is_that_of_the_first(pair: tuple[Path, Path]) -> None:
+    tensors, card = read_weights(pair[0])
+    older = {k: v for k, v in card["config"]["diffusion"].items() if k != "guidance"}
+    for path, diffusion in zip(pair, ({**older, "temperature": 0.3}, older), strict=True):
+        write_weights(path, tensors, {**card, "config": {**card["config"], "diffusion": diffusion}})
+    assert mix_weights(pair)[1]["config"]["diffusion"]["temperature"] == 0.3
+
+
 def test_the_verb_writes_weights_that_sample(cli: Any, pair: tuple[Path, Path], tmp_path: Path) -> None:
     out = tmp_path / "mixed.safetensors"
     answer = cli("mix", *pair, "--shares", "[1.5, -0.5]", "--out", out, "--half")
