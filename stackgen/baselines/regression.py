@@ -30,7 +30,7 @@ from stackgen.models.transformer import (
     run_blocks,
     sinusoids,
 )
-from stackgen.world import World
+from stackgen.world import Grid, World
 
 _FORBIDDEN = 1e6  # cost of giving a block another shape's pose
 
@@ -73,9 +73,9 @@ class BlockTokens(nn.Module):
 class SilhouetteTokens(nn.Module):
     """Silhouette to tokens, as the denoiser makes them: patches, and in `cross` a short encoder over them."""
 
-    def __init__(self, config: TransformerConfig, image_size: int) -> None:
+    def __init__(self, config: TransformerConfig, grid: Grid) -> None:
         super().__init__()
-        self.patches = Patches(config, image_size)
+        self.patches = Patches(config, grid)
         self.layers = memory_layers(config)
 
     def forward(self, silhouette: Tensor) -> Tensor:
@@ -132,7 +132,7 @@ class PoseRegressor(PoseNetwork):
             raise StackgenError("self_conditioning: only a denoiser has an earlier estimate to look at")
         self.transformer, self.regression = transformer, regression
         self.blocks = BlockTokens(transformer, world)
-        self.silhouette = SilhouetteTokens(transformer, world.grid.image_size)
+        self.silhouette = SilhouetteTokens(transformer, world.grid)
         self.head = pose_head(transformer)
 
     @property

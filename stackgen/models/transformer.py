@@ -20,6 +20,13 @@ from torch.nn import functional as F
 
 from stackgen.errors import StackgenError
 from stackgen.models.poses import POSE
+from stackgen.world import Grid
+
+WAVES = 16
+"""Number of wavelengths in which a place is written along each axis."""
+
+SHORTEST, LONGEST = 0.5, 64.0
+"""Those wavelengths' bounds [cell]."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +50,9 @@ class TransformerConfig:
             permutations which one it is.
         self_conditioning: Whether the denoiser is shown its own last estimate of the clean poses too (Chen, Zhang
             & Hinton 2023), so that it keeps to a layout once chosen.
+        places: Whether silhouette patches and noisy blocks are told where they are, across and up [cell], by the same
+            sines and cosines, so that a block finds what is near it on a grid of any size. The paper numbers the
+            patches row by row, and the blocks have their normalised poses alone.
 
     Raises:
         StackgenError: If there can be no such network.
@@ -60,6 +70,7 @@ class TransformerConfig:
     dropout: float = 0.0
     ordered: bool = False
     self_conditioning: bool = False
+    places: bool = False
 
     def __post_init__(self) -> None:
         for name in ("width", "heads", "feedforward", "patch", "stride"):
@@ -141,29 +152,37 @@ def run_blocks(
 
 
 class Patches(nn.Module):
-    """Silhouette to tokens: each patch through a two-layer MLP, plus sinusoidal positions.
+    """Silhouette to tokens: each patch through a two-layer MLP, plus sinusoidal positions, or its place.
 
     Raises:
         StackgenError: If the patches do not tile the picture.
     """
 
-    def __init__(self, config: TransformerConfig, image_size: int) -> None:
+    def __init__(self, config: TransformerConfig, grid: Grid) -> None:
         super().__init__()
-        patch, stride, width = config.patch, config.stride, config.width
+        patch, stride, width, image_size = config.patch, config.stride, config.width, grid.image_size
         if patch > image_size or (image_size - patch) % stride:
             raise StackgenError(
                 f"denoiser: patches of {patch} pixels every {stride} do not tile {image_size} pixels;"
                 " set patch and stride so that image_size - patch is a multiple of stride"
             )
         self.patch, self.stride = patch, stride
-        count = ((image_size - patch) // stride + 1) ** 2
         self.mlp = mlp(patch * patch, width, width)
-        self.register_buffer("positions", sinusoids(torch.arange(count).float(), width), persistent=False)
+        middles = torch.arange((image_size - patch) // stride + 1) * float(stride) + patch / 2  # [pixel]
+        self.place: nn.Module = nn.Identity()
+        if config.places:
+            x = (middles - image_size / 2) / grid.pixels_per_cell
+            z = (image_size - grid.ground_margin - middles) / grid.pixels_per_cell
+            positions = waves(torch.cartesian_prod(z, x).flip(-1))
+            self.place = nn.Linear(positions.shape[-1], width)
+        else:
+            positions = sinusoids(torch.arange(len(middles) ** 2).float(), width)
+        self.register_buffer("positions", positions, persistent=False)
 
     def forward(self, silhouette: Tensor) -> Tensor:
         """(B, H, W) to (B, C, d), row by row from the top left."""
         patches = silhouette.unfold(1, self.patch, self.stride).unfold(2, self.patch, self.stride)  # (B, r, c, p, p)
-        return self.mlp(patches.flatten(3).flatten(1, 2)) + self.positions
+        return self.mlp(patches.flatten(3).flatten(1, 2)) + self.place(self.positions)
 
 
 class EncoderLayer(nn.Module):
@@ -265,4 +284,11 @@ def sinusoids(positions: Tensor, width: int) -> Tensor:
     half = width // 2
     rates = torch.exp(-math.log(10_000) * torch.arange(half, device=positions.device) / half)
     angles = positions[:, None] * rates
+    return torch.cat([angles.sin(), angles.cos()], dim=-1)
+
+
+def waves(places: Tensor) -> Tensor:
+    """(..., 2) places across and up [cell] to (..., 4 * WAVES) sines and cosines, from SHORTEST to LONGEST."""
+    steps = torch.linspace(math.log(SHORTEST), math.log(LONGEST), WAVES, device=places.device)
+    angles = (places[..., None] * (2 * math.pi / steps.exp())).flatten(-2)
     return torch.cat([angles.sin(), angles.cos()], dim=-1)

@@ -5,10 +5,14 @@ Legend: B scenes, N block tokens, C silhouette tokens, d width.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import torch
 from torch import Tensor, nn
 
 from stackgen.models.poses import POSE, ranks
 from stackgen.models.transformer import (
+    WAVES,
     Patches,
     TransformerConfig,
     block_layers,
@@ -18,6 +22,7 @@ from stackgen.models.transformer import (
     pose_head,
     run_blocks,
     sinusoids,
+    waves,
 )
 from stackgen.world import World
 
@@ -27,7 +32,7 @@ class Denoiser(nn.Module):
 
     Args:
         config: Architecture.
-        world: Size of the shape codebook, edge of the silhouette [pixel], and N.
+        world: Size of the shape codebook, grid of the silhouette, and N.
     """
 
     def __init__(self, config: TransformerConfig, world: World) -> None:
@@ -41,8 +46,12 @@ class Denoiser(nn.Module):
         if config.self_conditioning:
             self.estimate_embedding = nn.Linear(POSE, d, bias=False)
             nn.init.zeros_(self.estimate_embedding.weight)
+        if config.places:
+            self.place_embedding = nn.Linear(4 * WAVES, d, bias=False)
+            self.estimate_place_embedding = nn.Linear(4 * WAVES, d, bias=False)
+            nn.init.zeros_(self.estimate_place_embedding.weight)
         self.time_embedding = mlp(d, d, d)
-        self.patches = Patches(config, world.grid.image_size)
+        self.patches = Patches(config, world.grid)
         self.memory_encoder = memory_layers(config)
         self.layers = block_layers(config, config.layers)
         self.final_norm = final_norm(config)
@@ -56,7 +65,14 @@ class Denoiser(nn.Module):
         return tokens
 
     def forward(
-        self, poses: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor, estimate: Tensor | None = None
+        self,
+        poses: Tensor,
+        t: Tensor,
+        shapes: Tensor,
+        mask: Tensor,
+        memory: Tensor,
+        estimate: Tensor | None = None,
+        places: Callable[[Tensor], Tensor] | None = None,
     ) -> Tensor:
         """Estimate (B, N, 6) for normalised noisy poses (B, N, 6).
 
@@ -68,6 +84,7 @@ class Denoiser(nn.Module):
             memory: (B, C, d) of `encode`; or (B / n, C, d), serving n consecutive rows each.
             estimate: (B, N, 6) last estimate of the clean poses, normalised; None if there is none yet,
                 or the network takes none.
+            places: Function from normalised poses to places (B, N, 2) across and up [cell]; used if `config.places`.
         """
         time = self.time_embedding(sinusoids(t.float(), self.config.width))  # (B, d)
         tokens = self.pose_embedding(poses) + self.shape_embedding(shapes.clamp(min=0))
@@ -75,5 +92,11 @@ class Denoiser(nn.Module):
             tokens = tokens + self.rank_embedding(ranks(shapes))
         if estimate is not None and self.config.self_conditioning:
             tokens = tokens + self.estimate_embedding(estimate)
+        if self.config.places:
+            assert places is not None
+            tokens = tokens + self.place_embedding(waves(places(poses)))
+            if estimate is not None and self.config.self_conditioning:
+                at_first = waves(places(torch.zeros_like(estimate)))  # no estimate yet, as zeros, must add nothing
+                tokens = tokens + self.estimate_place_embedding(waves(places(estimate)) - at_first)
         tokens = run_blocks(self.layers, self.config, blocks=tokens, mask=mask, memory=memory, condition=time)
         return self.head(self.final_norm(tokens))

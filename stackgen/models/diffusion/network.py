@@ -123,7 +123,7 @@ class PoseDiffusion(PoseNetwork):
             if self.denoiser.config.self_conditioning
             else None
         )
-        estimate = self.denoiser(noisy, t, shapes, mask, memory, seen)
+        estimate = self.denoiser(noisy, t, shapes, mask, memory, seen, self._places)
         target = noise if self.config.prediction == "epsilon" else self._velocity(clean, noise, t)
         error = (estimate - target).square().mean(-1) * mask
         return error.sum(-1) / mask.sum(-1), t
@@ -140,7 +140,7 @@ class PoseDiffusion(PoseNetwork):
         elif draws % 2:
             chosen = rows % draws < draws // 2
         found = torch.zeros_like(noisy)
-        estimate = self.denoiser(noisy[chosen], t[chosen], shapes[chosen], mask[chosen], memory)
+        estimate = self.denoiser(noisy[chosen], t[chosen], shapes[chosen], mask[chosen], memory, None, self._places)
         found[chosen] = self._clean(noisy[chosen], t[chosen], estimate)
         return found
 
@@ -149,6 +149,10 @@ class PoseDiffusion(PoseNetwork):
         signal, sigma = self.schedule.signal_and_noise(t)
         clean = signal * x - sigma * estimate if self.config.prediction == "v" else (x - sigma * estimate) / signal
         return self._bounded(clean)
+
+    def _places(self, poses: Tensor) -> Tensor:
+        """Places (B, N, 2) across and up [cell] of normalised poses."""
+        return (poses * self.std + self.mean)[..., [0, 2]]
 
     def _bounded(self, clean: Tensor) -> Tensor:
         return clean if self.config.clip is None else clean.clamp(-self.config.clip, self.config.clip)
@@ -204,7 +208,7 @@ class PoseDiffusion(PoseNetwork):
 
         def predict(x: Tensor, t: Tensor) -> Tensor:
             nonlocal last
-            last = self._clean(x, t, self.denoiser(x, t, shapes, mask, memory, last))
+            last = self._clean(x, t, self.denoiser(x, t, shapes, mask, memory, last, self._places))
             return last
 
         return predict

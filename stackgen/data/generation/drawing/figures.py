@@ -72,6 +72,10 @@ class Pencil:
         value = self.rng.uniform(low, max(low, high))
         return self.snapped(value, least=self.step or 0.25)
 
+    def place(self, low: float, high: float) -> float:
+        """Draw a place between two, on the ruler; the first where there is no room up to the second."""
+        return self.snapped(self.rng.uniform(low, max(low, high)))
+
     def snapped(self, value: float, least: float = 0.0) -> float:
         """Move a length to the ruler's nearest line, at least to `least`."""
         return max(least, float(np.round(value / self.step) * self.step) if self.step else float(value))

@@ -22,7 +22,7 @@ def _boxes(p: Pencil) -> Figure:
         wide, high = min(p.wide, p.length(0.5, p.wide)), p.length(0.5, max(0.5, p.high / 2))
         under = placed[int(p.rng.integers(len(placed)))] if placed and p.chance(0.6) else (0.0, 0.0, p.wide, 0.0)
         low = under[1] + under[3]
-        left = p.snapped(p.rng.uniform(under[0] - wide / 2, under[0] + under[2] - wide / 2))
+        left = p.place(under[0] - wide / 2, under[0] + under[2] - wide / 2)
         left = min(max(left, 0.0), p.wide - wide)
         if low + high <= p.high + 1e-9:
             placed.append((left, low, wide, high))
@@ -40,7 +40,7 @@ def _slopes(p: Pencil) -> Figure:
     high = max(0.5, p.high - low)
     kind, parts = int(p.rng.integers(4)), [rectangle(0, 0, p.wide, low)] if low else []
     if kind == 3:  # a hip, or a slope that is cut off
-        left, right = (p.snapped(p.rng.uniform(0, p.wide / 2)) for _ in range(2))
+        left, right = (p.place(0, p.wide / 2) for _ in range(2))
         parts.append(np.array([[0, low], [p.wide, low], [p.wide - right, low + high], [left, low + high]]))
     else:
         parts.append(gable(0, low, p.wide, high, (0.0, 1.0, 0.5)[kind]))
@@ -73,7 +73,7 @@ def _bridge(p: Pencil) -> Figure:
     parts = [rectangle(left, 0, pier, low) for left in lefts] + [rectangle(0, low, p.wide, deck)]
     if p.chance(0.4) and low + deck < p.high:
         wide = min(p.length(0.5, p.wide), p.wide)
-        parts.append(rectangle(p.snapped(p.rng.uniform(0, p.wide - wide)), low + deck, wide, p.high - low - deck))
+        parts.append(rectangle(p.place(0, p.wide - wide), low + deck, wide, p.high - low - deck))
     return Figure(tuple(parts))
 
 
@@ -102,7 +102,7 @@ def _tower(p: Pencil) -> Figure:
         high = min(p.length(0.5, p.high), p.high - top - low)
         parts.append(rectangle((p.wide - wide) / 2, low, wide, high))
         low += high
-        wide = min(p.wide, max(0.5, wide + p.snapped(p.rng.uniform(-1.6, 0.4))))
+        wide = min(p.wide, max(0.5, wide + p.place(-1.6, 0.4)))
     if top and p.chance(0.6):
         parts.append(gable((p.wide - wide) / 2, low, wide, top))
     elif top and wide > 1:
@@ -120,8 +120,8 @@ def _wall(p: Pencil) -> Figure:
         parts.append(rectangle(p.snapped(left), p.high - top, merlon, top))
     if p.chance(0.5) and p.wide > 2:
         wide, high = p.length(0.5, p.wide / 2), p.length(0.5, max(0.5, p.high - top - 0.5))
-        left = p.snapped((p.wide - wide) / 2 if p.chance(0.6) else p.rng.uniform(0.5, p.wide - wide - 0.5))
-        sill = -1.0 if p.chance(0.6) else p.snapped(p.rng.uniform(0.5, p.high / 2))
+        left = p.snapped((p.wide - wide) / 2 if p.chance(0.6) else p.place(0.5, p.wide - wide - 0.5))
+        sill = -1.0 if p.chance(0.6) else p.place(0.5, p.high / 2)
         holes.append(rectangle(left, sill, wide, high - min(sill, 0)))
     return Figure(tuple(parts), tuple(holes))
 

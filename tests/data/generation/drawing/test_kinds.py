@@ -59,6 +59,14 @@ def test_a_figure_on_a_ruler_is_as_large_as_asked_for_or_smaller(kind: str) -> N
         assert (high - low <= np.array([4.0, 3.0]) + 1.6).all() and (high - low > 0.2).all()
 
 
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("size", [(7.9, 0.6), (0.6, 7.9), (2.2, 1.0)])
+def test_a_figure_can_be_far_wider_than_high(kind: str, size: tuple[float, float]) -> None:
+    for step in RULERS.values():
+        for seed in range(40):
+            assert draw_figure(kind, Pencil(np.random.default_rng(seed), *size, step, PAPER_CATALOGUE)).parts
+
+
 def test_edges_of_boxes_lie_on_the_ruler() -> None:
     for step in (1.0, 0.5):
         for seed in range(40):
