@@ -323,7 +323,8 @@ def load(
             `brute-force`), a `.safetensors` file, a `.ckpt` of our training, or the folder of a run; or
             a sampler itself.
         block_list_weights: Weights of the block-list network: a name in the package, a `.safetensors` file, a `.ckpt`
-            of our training, or the folder of a run; they are read when they are first needed.
+            of our training, or the folder of a run; by default those that ship for the sampler's world. They are read
+            when they are first needed.
         sampler: Settings by which a diffusion model samples; what is null is as its weights have it.
 
     Raises:
@@ -334,7 +335,7 @@ def load(
     def predictor() -> BlockListPredictor:
         from stackgen.sampling.methods import load_predictor
 
-        found = load_predictor(block_list_weights)
+        found = load_predictor(block_list_weights, loaded.world)
         if found.world != loaded.world:
             name = record.name if record else type(loaded).__name__
             raise StackgenError(

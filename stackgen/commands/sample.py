@@ -47,7 +47,8 @@ def main(
         blocks: Block list, such as cube=3,rectangle=2; it is chosen by default.
         inventory: Blocks that are available, such as cube=4,rectangle=3; the block list is chosen among them.
         seed: Seed of the samples: the same seed gives the same stacks, unless --budget is a time.
-        cells: Height of the structure in cells, such as 6, or width and height, such as 6x5; auto finds it, up to 8.
+        cells: Height of the structure in cells, such as 6, or width and height, such as 6x5; auto finds it, up to 8, or
+            fills the grid of weights that are named.
         prefer: Stacks that come first: those of the best fit, or of those that fit nearly as well the ones of the
             largest margin against tilting.
         weights: Weights of the sampler: a name (search is one), a .safetensors file, a .ckpt file or a run folder.
@@ -71,13 +72,13 @@ def main(
         raise StackgenError(f"--num_samples must be at least 1, got {num_samples}")
     folders = result_folders(images, out)
     asked: dict[str, Any] = {"num_samples": num_samples, "seed": seed, "blocks": blocks, "inventory": inventory}
+    height = Cells.parse(cells)
     own = one_shot or verify is not None or sampler != SamplerConfig()
     if own or weights != DEFAULT or block_list_weights != DEFAULT:
-        if cells != "auto" or prefer != "fit":
-            raise StackgenError("--cells and --prefer belong to the search: leave out what asks for single samples")
-        draw = of_model(load(weights, block_list_weights, sampler), asked, verify, budget)
+        if prefer != "fit":
+            raise StackgenError("--prefer belongs to the search: leave out what asks for single samples")
+        draw = of_model(load(weights, block_list_weights, sampler), asked, verify, budget, height)
     else:
-        Cells.parse(cells)
         search = within(None if budget is None else Budget.parse(budget), prefer)
 
         def draw(image: Path, reading: Reading) -> StacksFile:

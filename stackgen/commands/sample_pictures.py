@@ -21,6 +21,7 @@ from stackgen.io.stacks_file import StacksFile, write_stacks
 from stackgen.io.terminal import Screen
 from stackgen.names import CheckerName
 from stackgen.sampling.verified import Budget
+from stackgen.search.scale import Cells
 from stackgen.stack import format_block_list
 from stackgen.vision.options import PictureOptions
 from stackgen.vision.reader import Reading, read_picture
@@ -34,7 +35,7 @@ POOR = 0.8
 """Front IoU below which a line says what could help."""
 
 
-def of_model(model: Model, asked: dict[str, Any], verify: CheckerName | None, budget: str | None) -> Draw:
+def of_model(model: Model, asked: dict[str, Any], verify: CheckerName | None, budget: str | None, cells: Cells) -> Draw:
     """Make the function that samples from a model; mistakes come to light before any work is done."""
     if budget is not None and verify is None:
         raise StackgenError("--budget limits --verify: give both, or neither")
@@ -45,6 +46,9 @@ def of_model(model: Model, asked: dict[str, Any], verify: CheckerName | None, bu
         sample = partial(model.sample_verified, **asked, verify=verify, budget=Budget.parse(budget) if budget else None)
 
     def draw(image: Path, reading: Reading) -> StacksFile:
+        if cells.high is not None:
+            figure = cells.stretched(reading.figure)
+            reading = replace(reading, figure=figure, cell=len(figure) / cells.high, exact=None)
         return replace(sample(reading), silhouette=image.name)
 
     return draw

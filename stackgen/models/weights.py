@@ -99,6 +99,16 @@ def resolve(weights: str | Path, role: str = "sampler", other_names: Sequence[st
     )
 
 
+def predictor_of(world: World) -> str:
+    """Name the block-list network that ships for a world; the default one where none does."""
+    default = DEFAULTS["predictor"]
+    for name in (default, *sorted(path.stem for path in FOLDER.glob("*.json"))):
+        card = read_json(FOLDER / f"{name}.json")
+        if card["kind"] == "blocklist" and World.from_json(card) == world:
+            return name
+    return default
+
+
 def last_checkpoint(folder: Path) -> Path:
     """Find the `last.ckpt` of a run, that of its highest version, or of one version.
 

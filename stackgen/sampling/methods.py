@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 from stackgen.baselines import HEURISTICS
 from stackgen.errors import StackgenError
+from stackgen.names import DEFAULT
 from stackgen.protocols import BlockListPredictor, StackSampler
 from stackgen.search.sampler import NAME, SearchBlockLists, SearchSampler
-from stackgen.world import PAPER_WORLD
+from stackgen.world import PAPER_WORLD, World
 
 if TYPE_CHECKING:
     from stackgen.models.weights import Maker
 
 
-def load_sampler(weights: str | Path = "default") -> StackSampler:
+def load_sampler(weights: str | Path = DEFAULT) -> StackSampler:
     """Load the sampler behind a name (`search`, a heuristic's, that of weights), a weights file or a run.
 
     Raises:
@@ -32,14 +33,22 @@ def load_sampler(weights: str | Path = "default") -> StackSampler:
     return _load(weights, "sampler", _samplers())
 
 
-def load_predictor(weights: str | Path = "default") -> BlockListPredictor:
+def load_predictor(weights: str | Path = DEFAULT, world: World = PAPER_WORLD) -> BlockListPredictor:
     """Load the block-list predictor behind a name (`search`, or that of weights), a weights file or a run.
+
+    Args:
+        weights: What to load; `default` is what ships for the world.
+        world: World of the sampler that it is for.
 
     Raises:
         StackgenError: If there is no such thing, or it holds something else.
     """
     if str(weights) == NAME:
-        return SearchBlockLists()
+        return SearchBlockLists(world)
+    if str(weights) == DEFAULT:
+        from stackgen.models.weights import predictor_of
+
+        weights = predictor_of(world)
     return _load(weights, "block-list predictor", _predictors())
 
 

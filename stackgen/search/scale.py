@@ -73,6 +73,13 @@ class Cells:
             )
         return Cells(int(found[2]), int(found[1]) if found[1] else None)
 
+    def stretched(self, figure: Mask) -> Mask:
+        """Give a figure (h, w) the proportions of these cells, where height and width are known."""
+        if self.wide is None or self.high is None:
+            return figure
+        size = (len(figure) * self.wide // self.high or 1, len(figure))
+        return cv2.resize(figure.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+
 
 @dataclass(frozen=True)
 class Scaled:
@@ -138,9 +145,7 @@ def best_scale(
     Raises:
         StackgenError: If the figure is too thin to be seen at any scale.
     """
-    if cells.wide is not None and cells.high is not None:  # stretched to its cells
-        size = (len(figure) * cells.wide // cells.high or 1, len(figure))
-        figure = cv2.resize(figure.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    figure = cells.stretched(figure)
     began = time.perf_counter()
 
     def answers(at: Scaled, wanted: int, share: float = 1.0) -> tuple[Answer, ...]:

@@ -109,7 +109,7 @@ class Reading:
         if height > grid.height + _ROOM or width > grid.width + _ROOM:
             raise StackgenError(
                 f"the structure is {width:.1f} x {height:.1f} cells, and the grid {grid.width} x {grid.height};"
-                " leave out --cell_size to have it scaled down"
+                " leave out --cell_size and --cells to have it scaled down"
             )
         return height
 

@@ -18,7 +18,9 @@ from stackgen.models.transformer import (
     attend,
     sinusoids,
     split_heads,
+    waves,
 )
+from stackgen.world import PAPER_GRID
 
 CONFIG = TransformerConfig(width=32, layers=2, heads=4, feedforward=48)
 NARROW = replace(CONFIG, width=8)
@@ -55,7 +57,7 @@ def test_attention_is_torch_s() -> None:
 
 def test_each_patch_is_one_token_row_by_row() -> None:
     torch.manual_seed(0)
-    patches = Patches(NARROW, 64)
+    patches = Patches(NARROW, PAPER_GRID)
     blank = patches(torch.zeros(1, 64, 64))
     for row, column in ((0, 0), (15, 16), (16, 15), (40, 63), (63, 63)):
         picture = torch.zeros(1, 64, 64)
@@ -66,7 +68,7 @@ def test_each_patch_is_one_token_row_by_row() -> None:
 
 def test_overlapping_patches_share_pixels() -> None:
     torch.manual_seed(0)
-    patches = Patches(replace(NARROW, stride=8), 64)
+    patches = Patches(replace(NARROW, stride=8), PAPER_GRID)
     blank = patches(torch.zeros(1, 64, 64))
     assert blank.shape == (1, 49, 8)
     picture = torch.zeros(1, 64, 64)
@@ -76,16 +78,33 @@ def test_overlapping_patches_share_pixels() -> None:
 
 def test_equal_patches_differ_by_their_positions_alone() -> None:
     torch.manual_seed(0)
-    tokens = Patches(NARROW, 64)(torch.ones(1, 64, 64))
+    tokens = Patches(NARROW, PAPER_GRID)(torch.ones(1, 64, 64))
     plain = tokens - sinusoids(torch.arange(16).float(), 8)
     assert close(plain, plain[:, :1].expand_as(plain))
     assert len({tuple(token) for token in tokens[0].tolist()}) == 16
 
 
+def test_a_patch_of_a_cell_is_where_its_cell_is() -> None:
+    """14 pixels a cell, 4 around it: from the left and from the ground, in cells."""
+    patches = Patches(replace(NARROW, patch=22, stride=14, places=True), PAPER_GRID)
+    z, x = torch.meshgrid(torch.tensor([3.5, 2.5, 1.5, 0.5]), torch.tensor([-1.5, -0.5, 0.5, 1.5]), indexing="ij")
+    assert close(patches.positions, waves(torch.stack([x, z], dim=-1).flatten(0, 1)))
+    plain = patches(torch.ones(1, 64, 64)) - patches.place(patches.positions)
+    assert close(plain, plain[:, :1].expand_as(plain))
+
+
+def test_how_alike_two_places_are_depends_on_their_distance_alone() -> None:
+    places = torch.rand(6, 2) * 8
+    alike = waves(places) @ waves(places).T
+    assert close(waves(places + torch.tensor([3.0, -2.0])) @ waves(places + torch.tensor([3.0, -2.0])).T, alike)
+    away = waves(torch.tensor([[0.0, 0.0]])) @ waves(torch.tensor([[0.0, 0.0], [0.1, 0.0], [0.5, 0.0], [4.0, 4.0]])).T
+    assert (away.diff() < 0).all()
+
+
 @pytest.mark.parametrize(("patch", "stride"), [(80, 16), (16, 7), (10, 10)])
 def test_patches_that_do_not_tile_are_refused(patch: int, stride: int) -> None:
     with pytest.raises(StackgenError, match="do not tile 64 pixels"):
-        Patches(replace(NARROW, patch=patch, stride=stride), 64)
+        Patches(replace(NARROW, patch=patch, stride=stride), PAPER_GRID)
 
 
 def test_sinusoids_tell_positions_apart() -> None:

@@ -19,7 +19,8 @@ from stackgen.world import PAPER_WORLD
 PAPER = TransformerConfig(width=32, layers=2, heads=4, feedforward=48)
 MASKED = replace(PAPER, mask_padding=True)
 CROSS = replace(PAPER, conditioning="cross", memory_layers=1, patch=16, stride=8)
-KINDS = {"paper": PAPER, "masked": MASKED, "cross": CROSS}
+PLACED = replace(CROSS, self_conditioning=True, places=True)
+KINDS = {"paper": PAPER, "masked": MASKED, "cross": CROSS, "placed": PLACED}
 BATCH, BLOCKS = 4, 7
 
 
@@ -51,7 +52,11 @@ def silhouettes(seed: int = 2) -> Tensor:
 
 @torch.no_grad()
 def run(model: Denoiser, inputs: dict[str, Tensor], picture: Tensor | None = None) -> Tensor:
-    return model(**inputs, memory=model.encode(silhouettes() if picture is None else picture))
+    return model(**inputs, memory=model.encode(silhouettes() if picture is None else picture), places=places)
+
+
+def places(poses: Tensor) -> Tensor:
+    return 2 * poses[..., [0, 2]] + 1
 
 
 def close(a: Tensor, b: Tensor) -> bool:
@@ -142,10 +147,10 @@ def test_masked_padding_may_be_left_out_and_the_paper_s_may_not(config: Transfor
 def test_one_memory_serves_several_rows(config: TransformerConfig) -> None:
     model, inputs = made(config), scene()
     memory = model.encode(silhouettes()[:2])
-    shared = model(**inputs, memory=memory)
-    repeated = model(**inputs, memory=memory.repeat_interleave(2, 0))
+    shared = model(**inputs, memory=memory, places=places)
+    repeated = model(**inputs, memory=memory.repeat_interleave(2, 0), places=places)
     assert close(shared, repeated)
-    assert not close(shared, model(**inputs, memory=memory.repeat(2, 1, 1)))
+    assert not close(shared, model(**inputs, memory=memory.repeat(2, 1, 1), places=places))
 
 
 @pytest.mark.parametrize("config", KINDS.values(), ids=KINDS)
@@ -169,6 +174,14 @@ def test_every_input_matters(config: TransformerConfig) -> None:
     ):
         assert not close(run(model, {**inputs, **change}), base)
     assert not close(run(model, inputs, silhouettes(3)), base)
+
+
+def test_zeros_are_no_estimate_wherever_they_lie() -> None:
+    model, inputs = made(PLACED), scene()
+    estimate = torch.randn(BATCH, BLOCKS, 6)
+    none, zeros, some = (run(model, {**inputs, "estimate": it}) for it in (None, 0 * estimate, estimate))
+    assert close(zeros, none)
+    assert not close(some, none)
 
 
 def test_an_untrained_cross_model_begins_with_zero() -> None:

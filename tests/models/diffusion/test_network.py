@@ -39,7 +39,7 @@ class Oracle(torch.nn.Module):
         return torch.zeros(len(silhouette), 1, 1)
 
     def forward(
-        self, x: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor, seen: Tensor | None = None
+        self, x: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor, seen: Tensor | None = None, *_: object
     ) -> Tensor:
         self.calls += 1
         (schedule, prediction), clean = self.parts, self.clean.repeat_interleave(len(x) // len(self.clean), 0)
@@ -52,7 +52,7 @@ class Silent(Oracle):
     """Estimates zero."""
 
     def forward(
-        self, x: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor, seen: Tensor | None = None
+        self, x: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor, seen: Tensor | None = None, *_: object
     ) -> Tensor:
         return torch.zeros_like(x)
 
@@ -338,7 +338,7 @@ def test_the_network_is_shown_its_last_estimate(batch: dict[str, Tensor], monkey
 
     def watched(x: Tensor, t: Tensor, *rest: Any) -> Tensor:
         out = forward(x, t, *rest)
-        shown.append((rest[-1], model._clean(x, t, out)))
+        shown.append((rest[-2], model._clean(x, t, out)))
         return out
 
     monkeypatch.setattr(model.denoiser, "forward", watched)

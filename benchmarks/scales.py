@@ -1,0 +1,208 @@
+"""What search, a sample of the network, verified samples and both give for drawings at the scale that a network knows.
+
+Drawings of every kind of docs/taught.md but designs, tidy and untidy, made for this purpose. `search` is asked for its best
+stack, `one sample` for the first with the network's list, `verified` draws until its time is up, and `both` gives half of the
+time to each and takes the better answer. Every answer is simulated; what falls has a front IoU of 0. Seconds are those of
+one core. Intervals are 95 %, over drawings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.table import Table
+
+from benchmarks.common import argument_parser, percent, plain_table, report, start
+from stackgen.data.generation.drawing.drawings import DrawingSettings, choose, draw, finish
+from stackgen.evaluation.intervals import clustered_ratio
+from stackgen.geometry import silhouette_iou
+from stackgen.vision.masks import bounding_box
+from stackgen.world import Mask, World
+
+if TYPE_CHECKING:
+    from stackgen.api import Model
+    from stackgen.stack import Stack
+
+SEARCH, ONE, VERIFIED, BOTH = "search", "one sample", "verified", "both"
+EFFORT = 20.0
+BLOCKS = ((1, 10), (11, 20), (21, 40))
+"""Groups of drawings, by the number of blocks that the search takes."""
+
+Method = Callable[[Mask], "Stack | None"]
+"""Function that answers a silhouette with the stack that it thinks best, as it stands in the end."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a method gave for a drawing.
+
+    Args:
+        stands: Whether its stack stands.
+        front_iou: Front IoU of the settled stack with the drawing; 0 if it fell.
+        seconds: Time [s].
+        blocks: Number of blocks.
+    """
+
+    stands: bool
+    front_iou: float
+    seconds: float
+    blocks: int
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options."""
+    options = argument_parser(__name__, __doc__)
+    options.add_argument("--weights", default="large", help="sampler: a name, file or run folder; its world counts")
+    options.add_argument("--block_list_weights", default="large-blocklist", help="block-list network of that world")
+    options.add_argument("--drawings", type=int, default=500, help="number of drawings")
+    options.add_argument(
+        "--smallest", type=float, default=5.0, help="least width or height, whichever is larger [cell]"
+    )
+    options.add_argument("--seconds", type=float, default=3.0, help="time for a drawing [s]")
+    options.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="who answers")
+    options.add_argument("--seed", type=int, default=1000, help="seed of the drawings and of the network")
+    return options
+
+
+def drawings(world: World, number: int, smallest: float, seed: int) -> list[Mask]:
+    """Draw silhouettes (H, W) of one size at least, each with a seed of its own."""
+    settings = DrawingSettings(smallest=smallest)
+    kinds = {kind: weight for kind, weight in settings.kinds.items() if kind != "design"}
+    found: list[Mask] = []
+    for i in range(2 * number):
+        rng = np.random.default_rng([seed, i])
+        kind = choose(kinds, rng)
+        drawing = finish(kind, draw(kind, world, settings, rng), world, settings, rng)
+        if drawing is not None and len(found) < number:
+            found.append(drawing.silhouette)
+    return found
+
+
+def _searched(model: Model, seconds: float, seed: int) -> Method:
+    from stackgen.sampling.best import best_stacks
+    from stackgen.search.problem import SearchSettings
+    from stackgen.vision.reader import Reading
+
+    settings = SearchSettings(seconds=seconds, effort=EFFORT)
+
+    def ask(target: Mask) -> Stack:
+        reading = Reading(target, "drawing", 1.0, np.zeros((*target.shape, 3), np.uint8), exact=target)
+        found = best_stacks(reading, model.world, model.checker, number=1, settings=settings)
+        return found.chosen[0].verdict.settled if found.chosen[0].verdict.stable else found.chosen[0].stack
+
+    return ask
+
+
+def _one_sample(model: Model, seconds: float, seed: int) -> Method:
+    return lambda target: model.sample(target, 1, seed)[0]
+
+
+def _verified(model: Model, seconds: float, seed: int) -> Method:
+    from stackgen.sampling.verified import Budget
+
+    return lambda target: model.sample_verified(target, 1, seed, budget=Budget.parse(f"{seconds}s")).stacks[0]
+
+
+def _both(model: Model, seconds: float, seed: int) -> Method:
+    def ask(target: Mask) -> Stack:
+        began = time.perf_counter()
+        first = _searched(model, seconds / 2, seed)(target)
+        left = max(0.1, seconds - (time.perf_counter() - began))
+        second = _verified(model, left, seed)(target)
+        return max((first, second), key=lambda stack: _fit(model, stack, target)[1])
+
+    return ask
+
+
+METHODS: Mapping[str, Callable[[Model, float, int], Method]] = {
+    SEARCH: _searched, ONE: _one_sample, VERIFIED: _verified, BOTH: _both,
+}  # fmt: skip
+
+
+def _fit(model: Model, stack: Stack, target: Mask) -> tuple[bool, float]:
+    """Say whether a stack stands, and how well it then fits."""
+    verdict = model.checker.check(stack)
+    return verdict.stable, silhouette_iou(verdict.settled, target, model.world.grid) if verdict.stable else 0.0
+
+
+def ask_all(method: Method, model: Model, targets: Sequence[Mask]) -> list[Answer]:
+    """Ask a method for every drawing; where it has no answer, nothing stands."""
+    from stackgen.errors import StackgenError
+
+    answers = []
+    for target in targets:
+        began = time.perf_counter()
+        try:
+            stack = method(target)
+        except StackgenError:
+            stack = None
+        seconds = time.perf_counter() - began
+        stands, iou = _fit(model, stack, target) if stack is not None else (False, 0.0)
+        answers.append(Answer(stands, iou, seconds, 0 if stack is None else len(stack)))
+    return answers
+
+
+def groups_of(targets: Sequence[Mask], blocks: Sequence[int], world: World) -> dict[str, list[int]]:
+    """Sort drawings by the number of their blocks and by their height [cell]; one may lie in several groups."""
+    groups: dict[str, list[int]] = {"all": list(range(len(targets)))}
+    for low, high in BLOCKS:
+        groups[f"{low} to {high} blocks"] = [i for i, number in enumerate(blocks) if low <= number <= high]
+    tall = [
+        len(range(*bounding_box(target)[0].indices(len(target)))) / world.grid.pixels_per_cell for target in targets
+    ]
+    groups["up to 5 cells high"] = [i for i, high in enumerate(tall) if high <= 5]
+    groups["more than 5 cells high"] = [i for i, high in enumerate(tall) if high > 5]
+    return {name: members for name, members in groups.items() if members}
+
+
+def row_of(answers: Sequence[Answer]) -> dict[str, Any]:
+    """Sum up answers."""
+    ones = np.ones(len(answers))
+    stability = clustered_ratio([answer.stands for answer in answers], ones)
+    iou = clustered_ratio([answer.front_iou for answer in answers], ones)
+    assert stability is not None and iou is not None
+    seconds = float(np.mean([answer.seconds for answer in answers]))
+    return {"stability": stability.to_json(), "front_iou": iou.to_json(), "seconds": seconds}
+
+
+def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Lay out what was measured."""
+    lines = [
+        [row["drawings"], str(row["number"]), row["method"], percent(row["stability"]), percent(row["front_iou"]),
+         f"{row['seconds']:.2f}"]
+        for row in rows
+    ]  # fmt: skip
+    headings = ("drawings", "number", "method", "stability", "front IoU", "seconds")
+    return plain_table("stability and front IoU in percent, seconds for a drawing", headings, lines)
+
+
+def main() -> None:
+    """Ask every method for every drawing."""
+    options = parser().parse_args()
+    from stackgen.api import load
+
+    model = load(options.weights, options.block_list_weights)
+    targets = drawings(model.world, options.drawings, options.smallest, options.seed)
+    _one_sample(model, 1.0, 0)(targets[0])  # weights are read once
+    found: dict[str, list[Answer]] = {}
+    for name in dict.fromkeys([SEARCH, *options.methods]):
+        found[name] = ask_all(METHODS[name](model, options.seconds, options.seed), model, targets)
+        total = row_of(found[name])
+        print(name, percent(total["stability"]), percent(total["front_iou"]), f"{total['seconds']:.2f} s", flush=True)
+    groups = groups_of(targets, [answer.blocks for answer in found[SEARCH]], model.world)
+    rows = [
+        {"drawings": group, "number": len(members), "method": name} | row_of([answers[i] for i in members])
+        for group, members in groups.items()
+        for name, answers in found.items()
+    ]
+    facts = {"smallest": options.smallest, "budget": options.seconds, "seed": options.seed, "rows": rows}
+    report("scales", facts, [table_of(rows)], options.out)
+
+
+if __name__ == "__main__":
+    start(main)
