@@ -122,6 +122,19 @@ def test_sample_leaves_file_picture_and_one_glb_per_stack(
     assert answer.out.count("stands") == 2
 
 
+def test_a_network_is_asked_at_the_height_that_is_given(
+    cli: Cli, towers: Model, tower_image: Path, tmp_path: Path
+) -> None:
+    for cells, size in (("2", (28, 28 / 3)), ("3x2", (28, 42))):
+        out = tmp_path / cells
+        assert cli("sample", tower_image, "--one_shot", "--cells", cells, "--out", out).code == 0
+        target = read_stacks(out / "stacks.json").target
+        assert target is not None
+        assert (target.any(axis=1).sum(), target.any(axis=0).sum()) == pytest.approx(size, abs=1.5)
+    answer = cli("sample", tower_image, "--one_shot", "--cells", 6, "--out", tmp_path / "out")
+    assert answer.code == 2 and "the grid 4 x 4" in answer.err and not (tmp_path / "out").exists()
+
+
 def test_same_seed_same_bytes_other_seed_others(cli: Cli, towers: Model, tower_image: Path, tmp_path: Path) -> None:
     for folder, seed in (("a", 5), ("b", 5), ("c", 6)):
         assert cli("sample", tower_image, "--one_shot", "--seed", seed, "--out", tmp_path / folder).code == 0
