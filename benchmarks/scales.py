@@ -1,9 +1,9 @@
 """What search, a sample of the network, verified samples and both give for drawings at the scale that a network knows.
 
-Drawings of every kind of docs/taught.md but designs, tidy and untidy, made for this purpose. `search` is asked for its best
-stack, `one sample` for the first with the network's list, `verified` draws until its time is up, and `both` gives half of the
-time to each and takes the better answer. Every answer is simulated; what falls has a front IoU of 0. Seconds are those of
-one core. Intervals are 95 %, over drawings.
+Drawings of every kind of docs/taught.md but designs, tidy and untidy, made for this purpose. `search` is asked for its
+best stack, `one sample` for the first with the network's list, `verified` draws until its time is up, and `both` gives
+half of the time to each and takes the better answer. Every answer is simulated; what falls has a front IoU of 0.
+Seconds are those of one core. Intervals are 95 %, over drawings.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from rich.table import Table
 
 from benchmarks.common import argument_parser, percent, plain_table, report, start
 from stackgen.data.generation.drawing.drawings import DrawingSettings, choose, draw, finish
+from stackgen.errors import StackgenError
 from stackgen.evaluation.intervals import clustered_ratio
 from stackgen.geometry import silhouette_iou
-from stackgen.vision.masks import bounding_box
 from stackgen.world import Mask, World
 
 if TYPE_CHECKING:
@@ -30,10 +30,11 @@ if TYPE_CHECKING:
 
 SEARCH, ONE, VERIFIED, BOTH = "search", "one sample", "verified", "both"
 EFFORT = 20.0
+"""Effort of the search, so large that its time is up first."""
 BLOCKS = ((1, 10), (11, 20), (21, 40))
 """Groups of drawings, by the number of blocks that the search takes."""
 
-Method = Callable[[Mask], "Stack | None"]
+Method = Callable[[Mask], "Stack"]
 """Function that answers a silhouette with the stack that it thinks best, as it stands in the end."""
 
 
@@ -132,18 +133,16 @@ def _fit(model: Model, stack: Stack, target: Mask) -> tuple[bool, float]:
 
 def ask_all(method: Method, model: Model, targets: Sequence[Mask]) -> list[Answer]:
     """Ask a method for every drawing; where it has no answer, nothing stands."""
-    from stackgen.errors import StackgenError
-
     answers = []
     for target in targets:
         began = time.perf_counter()
         try:
             stack = method(target)
-        except StackgenError:
-            stack = None
+        except StackgenError:  # nothing was found
+            answers.append(Answer(False, 0.0, time.perf_counter() - began, 0))
+            continue
         seconds = time.perf_counter() - began
-        stands, iou = _fit(model, stack, target) if stack is not None else (False, 0.0)
-        answers.append(Answer(stands, iou, seconds, 0 if stack is None else len(stack)))
+        answers.append(Answer(*_fit(model, stack, target), seconds, len(stack)))
     return answers
 
 
@@ -152,9 +151,7 @@ def groups_of(targets: Sequence[Mask], blocks: Sequence[int], world: World) -> d
     groups: dict[str, list[int]] = {"all": list(range(len(targets)))}
     for low, high in BLOCKS:
         groups[f"{low} to {high} blocks"] = [i for i, number in enumerate(blocks) if low <= number <= high]
-    tall = [
-        len(range(*bounding_box(target)[0].indices(len(target)))) / world.grid.pixels_per_cell for target in targets
-    ]
+    tall = [np.count_nonzero(target.any(axis=1)) / world.grid.pixels_per_cell for target in targets]
     groups["up to 5 cells high"] = [i for i, high in enumerate(tall) if high <= 5]
     groups["more than 5 cells high"] = [i for i, high in enumerate(tall) if high > 5]
     return {name: members for name, members in groups.items() if members}

@@ -158,6 +158,8 @@ class Patches(nn.Module):
         StackgenError: If the patches do not tile the picture.
     """
 
+    positions: Tensor
+
     def __init__(self, config: TransformerConfig, grid: Grid) -> None:
         super().__init__()
         patch, stride, width, image_size = config.patch, config.stride, config.width, grid.image_size

@@ -30,7 +30,14 @@ class Blind(Denoiser):
         return silhouette.flatten(1).any(1)[:, None, None]
 
     def forward(
-        self, poses: Tensor, t: Tensor, shapes: Tensor, mask: Tensor, memory: Tensor, estimate: Tensor | None = None, *_: object
+        self,
+        poses: Tensor,
+        t: Tensor,
+        shapes: Tensor,
+        mask: Tensor,
+        memory: Tensor,
+        estimate: Tensor | None = None,
+        *_: object,
     ) -> Tensor:
         shown = memory.repeat_interleave(len(poses) // len(memory), 0)
         clean = torch.where(shown, self.seeing, self.blind)
