@@ -266,7 +266,8 @@ def test_the_command_line_verifies_and_answers_by_its_exit_code(
     ("options", "message"),
     [
         (["--one_shot", "--budget", "1s"], "--verify"),
-        (["--one_shot", "--cells", "3"], "--cells"),
+        (["--one_shot", "--cells", "6"], "--cells"),
+        (["--one_shot", "--prefer", "margin"], "--prefer"),
         (["--cells", "9"], "cells"),
         (["--verify", "--budget", "soon"], "a time, such as 1s"),
         (["--one_shot", "--inventory", "cube=1"], "tower.png: the inventory cube=1 is too small"),
