@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import pickle
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from stackgen.errors import StackgenError
 from stackgen.models import weights as module
 from stackgen.models.weights import export_checkpoint, read_weights, resolve, write_weights
 from stackgen.sampling.methods import load_predictor, load_sampler
-from stackgen.world import PAPER_WORLD
+from stackgen.world import PAPER_WORLD, World
 from tests.conftest import TinyWeights
 
 
@@ -105,6 +106,25 @@ def test_names_are_found_in_the_package(copies: TinyWeights, monkeypatch: pytest
     load_predictor()
     refused("dpm", r"dpm", r"cnn, ddpm")
     refused("../x", r"\.\./x")
+
+
+def test_the_default_block_lists_are_those_of_the_sampler_s_world(
+    copies: TinyWeights, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "FOLDER", tmp_path)
+    monkeypatch.setattr(module, "DEFAULTS", {"sampler": "ddpm", "predictor": "cnn"})
+    tensors, card = read_weights(copies.predictor)
+    longer = replace(PAPER_WORLD, grid=replace(PAPER_WORLD.grid, height=5, image_size=80))
+    write_weights(tmp_path / "a.safetensors", tensors, {**card, **longer.to_json(), "name": "a"})
+    assert load_predictor("default", longer).card["name"] == "a"
+    assert load_predictor("default", PAPER_WORLD).card["name"] == "cnn"
+    assert load_predictor("default", replace(PAPER_WORLD, max_blocks=9)).card["name"] == "cnn"
+
+
+def test_each_network_that_ships_has_block_lists_of_its_world() -> None:
+    for path in module.FOLDER.glob("*.json"):
+        world = World.from_json(json.loads(path.read_text()))
+        assert load_predictor("default", world).world == world
 
 
 # What is not there, or is something else.
