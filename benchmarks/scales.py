@@ -33,6 +33,8 @@ EFFORT = 20.0
 """Effort of the search, so large that its time is up first."""
 BLOCKS = ((1, 10), (11, 20), (21, 40))
 """Groups of drawings, by the number of blocks that the search takes."""
+HEIGHTS = ((0, 3), (3, 5), (5, 7), (7, 9), (5, 9))
+"""Groups of drawings, by their height [cell]: above the first number, up to the second."""
 
 Method = Callable[[Mask], "Stack"]
 """Function that answers a silhouette with the stack that it thinks best, as it stands in the end."""
@@ -152,8 +154,8 @@ def groups_of(targets: Sequence[Mask], blocks: Sequence[int], world: World) -> d
     for low, high in BLOCKS:
         groups[f"{low} to {high} blocks"] = [i for i, number in enumerate(blocks) if low <= number <= high]
     tall = [np.count_nonzero(target.any(axis=1)) / world.grid.pixels_per_cell for target in targets]
-    groups["up to 5 cells high"] = [i for i, high in enumerate(tall) if high <= 5]
-    groups["more than 5 cells high"] = [i for i, high in enumerate(tall) if high > 5]
+    for low, high in HEIGHTS:
+        groups[f"{low} to {high} cells high"] = [i for i, cells in enumerate(tall) if low < cells <= high]
     return {name: members for name, members in groups.items() if members}
 
 
