@@ -9,9 +9,12 @@ Seconds are those of one core. Intervals are 95 %, over drawings.
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,6 +71,7 @@ def parser() -> argparse.ArgumentParser:
     )
     options.add_argument("--seconds", type=float, default=3.0, help="time for a drawing [s]")
     options.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS), help="who answers")
+    options.add_argument("--workers", type=int, default=1, help="processes that share the drawings, each with a core")
     options.add_argument("--seed", type=int, default=1000, help="seed of the drawings and of the network")
     return options
 
@@ -148,6 +152,24 @@ def ask_all(method: Method, model: Model, targets: Sequence[Mask]) -> list[Answe
     return answers
 
 
+def asked(options: argparse.Namespace) -> tuple[Model, list[Mask]]:
+    """Load the model, and draw what it is asked for."""
+    from stackgen.api import load
+
+    model = load(options.weights, options.block_list_weights)
+    return model, drawings(model.world, options.drawings, options.smallest, options.seed)
+
+
+def share(options: argparse.Namespace, name: str, number: int) -> list[Answer]:
+    """Ask a method for each drawing that falls to a process, on one thread."""
+    import torch
+
+    torch.set_num_threads(1)
+    model, targets = asked(options)
+    model.sample(targets[0], 1, 0)  # what is read or compiled once is not measured
+    return ask_all(METHODS[name](model, options.seconds, options.seed), model, targets[number :: options.workers])
+
+
 def groups_of(targets: Sequence[Mask], blocks: Sequence[int], world: World) -> dict[str, list[int]]:
     """Sort drawings by the number of their blocks and by their height [cell]; one may lie in several groups."""
     groups: dict[str, list[int]] = {"all": list(range(len(targets)))}
@@ -183,16 +205,15 @@ def table_of(rows: Sequence[Mapping[str, Any]]) -> Table:
 def main() -> None:
     """Ask every method for every drawing."""
     options = parser().parse_args()
-    from stackgen.api import load
-
-    model = load(options.weights, options.block_list_weights)
-    targets = drawings(model.world, options.drawings, options.smallest, options.seed)
-    _one_sample(model, 1.0, 0)(targets[0])  # weights are read once
+    model, targets = asked(options)
     found: dict[str, list[Answer]] = {}
-    for name in dict.fromkeys([SEARCH, *options.methods]):
-        found[name] = ask_all(METHODS[name](model, options.seconds, options.seed), model, targets)
-        total = row_of(found[name])
-        print(name, percent(total["stability"]), percent(total["front_iou"]), f"{total['seconds']:.2f} s", flush=True)
+    with ProcessPoolExecutor(options.workers, multiprocessing.get_context("spawn")) as team:
+        for name in dict.fromkeys([SEARCH, *options.methods]):
+            parts = list(team.map(partial(share, options, name), range(options.workers)))
+            found[name] = [parts[i % options.workers][i // options.workers] for i in range(len(targets))]
+            total = row_of(found[name])
+            shown = percent(total["stability"]), percent(total["front_iou"]), f"{total['seconds']:.2f} s"
+            print(name, *shown, flush=True)
     groups = groups_of(targets, [answer.blocks for answer in found[SEARCH]], model.world)
     rows = [
         {"drawings": group, "number": len(members), "method": name} | row_of([answers[i] for i in members])
