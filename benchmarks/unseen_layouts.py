@@ -1,7 +1,8 @@
 """Which scenes of testset-v1 have a layout that a training set lacks, for results on what was never seen.
 
-Reads training sets (folders or compact files) and writes, for each, the scenes that it does not hold. The
-file ships with the package, so that nobody needs the training sets to make the report.
+Reads training sets (folders or compact files) and writes, for each, the scenes that it does not hold; `--together`
+takes several for one, as a training did. What the file knows of other training sets is kept. It ships with the package,
+so that nobody needs the training sets to make the report.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from stackgen.data.inspection.seen_layouts import seen_layouts
 from stackgen.evaluation.protocol import scenes_of
 from stackgen.evaluation.report.references import SEEN_FILE, SEEN_FORMAT
 from stackgen.io.files import write_json
+from stackgen.io.text import read_json
 
 NOTIONS = {"designs": True, "layouts": False}
 """Whether the cell in which each block begins counts."""
@@ -30,6 +32,7 @@ def parser() -> argparse.ArgumentParser:
         prog="python -m benchmarks.unseen_layouts", description=(__doc__ or "").partition("\n\n")[0]
     )
     options.add_argument("datasets", type=Path, nargs="+", help="training sets: folders or .npz files")
+    options.add_argument("--together", metavar="NAME", help="name of the one training set that they are")
     options.add_argument("--out", type=Path, default=SEEN_FILE, metavar="FILE.json", help="where to write")
     return options
 
@@ -39,7 +42,14 @@ def main() -> None:
     options = parser().parse_args()
     testset = Dataset.open(TESTSET)
     test = testset.split("test")
-    entries = [compare(path, test) for path in options.datasets]
+    datasets = [Dataset.open(path) for path in options.datasets]
+    if options.together:
+        joined = Dataset.join(datasets)
+        entries = [compare(joined, test) | {"name": options.together}]
+    else:
+        entries = [compare(dataset, test) for dataset in datasets]
+    made = {entry["sha256"] for entry in entries}
+    entries = [entry for entry in known(options.out, testset) if entry["sha256"] not in made] + entries
     names = [entry["name"] for entry in entries]
     for entry in entries:
         if names.count(entry["name"]) > 1:  # made by other settings of the generator
@@ -52,13 +62,20 @@ def main() -> None:
     write_json(options.out, content, indent=None)
 
 
-def compare(path: Path, test: StackArrays) -> dict[str, Any]:
+def known(path: Path, testset: Dataset) -> list[dict[str, Any]]:
+    """Entries of an earlier file about the same test set."""
+    if not path.exists():
+        return []
+    content = read_json(path)
+    return content["training_sets"] if content.get("test_set") == testset.manifest.sha256 else []
+
+
+def compare(dataset: Dataset, test: StackArrays) -> dict[str, Any]:
     """A training set's entry.
 
     Raises:
         StackgenError: If it has no training split.
     """
-    dataset = Dataset.open(path)
     train = dataset.split("train")
     names = [scene.name for scene in scenes_of(test, dataset.world.catalogue)]
     unseen = {}
