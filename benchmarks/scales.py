@@ -30,6 +30,7 @@ from stackgen.world import Mask, World
 if TYPE_CHECKING:
     from stackgen.api import Model
     from stackgen.stack import Stack
+    from stackgen.vision.reader import Reading
 
 SEARCH, ONE, VERIFIED, BOTH = "search", "one sample", "verified", "both"
 EFFORT = 20.0
@@ -90,29 +91,35 @@ def drawings(world: World, number: int, smallest: float, seed: int) -> list[Mask
     return found
 
 
+def _as_it_is(target: Mask) -> Reading:
+    """A silhouette as what was read in a picture, so that nobody reads it once more."""
+    from stackgen.vision.reader import Reading
+
+    return Reading(target, "drawing", 1.0, np.zeros((*target.shape, 3), np.uint8), exact=target)
+
+
 def _searched(model: Model, seconds: float, seed: int) -> Method:
     from stackgen.sampling.best import best_stacks
     from stackgen.search.problem import SearchSettings
-    from stackgen.vision.reader import Reading
 
     settings = SearchSettings(seconds=seconds, effort=EFFORT)
 
     def ask(target: Mask) -> Stack:
-        reading = Reading(target, "drawing", 1.0, np.zeros((*target.shape, 3), np.uint8), exact=target)
-        found = best_stacks(reading, model.world, model.checker, number=1, settings=settings)
+        found = best_stacks(_as_it_is(target), model.world, model.checker, number=1, settings=settings)
         return found.chosen[0].verdict.settled if found.chosen[0].verdict.stable else found.chosen[0].stack
 
     return ask
 
 
 def _one_sample(model: Model, seconds: float, seed: int) -> Method:
-    return lambda target: model.sample(target, 1, seed)[0]
+    return lambda target: model.sample(_as_it_is(target), 1, seed)[0]
 
 
 def _verified(model: Model, seconds: float, seed: int) -> Method:
     from stackgen.sampling.verified import Budget
 
-    return lambda target: model.sample_verified(target, 1, seed, budget=Budget.parse(f"{seconds}s")).stacks[0]
+    budget = Budget.parse(f"{seconds}s")
+    return lambda target: model.sample_verified(_as_it_is(target), 1, seed, budget=budget).stacks[0]
 
 
 def _both(model: Model, seconds: float, seed: int) -> Method:
@@ -123,7 +130,7 @@ def _both(model: Model, seconds: float, seed: int) -> Method:
         first = _searched(model, seconds / 2, seed)(target)
         left = max(0.1, seconds - (time.perf_counter() - began))
         budget = Budget.parse(f"{left}s")
-        second = model.sample_verified(target, 1, seed, blocks=first.counts, budget=budget).stacks[0]
+        second = model.sample_verified(_as_it_is(target), 1, seed, blocks=first.counts, budget=budget).stacks[0]
         return max((first, second), key=lambda stack: _fit(model, stack, target)[1])
 
     return ask
@@ -169,7 +176,7 @@ def share(options: argparse.Namespace, name: str, number: int) -> list[Answer]:
 
     torch.set_num_threads(1)
     model, targets = asked(options)
-    model.sample(targets[0], 1, 0)  # what is read or compiled once is not measured
+    model.sample(_as_it_is(targets[0]), 1, 0)  # what is read or compiled once is not measured
     return ask_all(METHODS[name](model, options.seconds, options.seed), model, targets[number :: options.workers])
 
 
