@@ -9,6 +9,7 @@ simulated; what falls has a front IoU of 0. Seconds are those of one core. Inter
 from __future__ import annotations
 
 import argparse
+import itertools
 import multiprocessing
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 SEARCH, ONE, VERIFIED, BOTH = "search", "one sample", "verified", "both"
 EFFORT = 20.0
-"""Effort of the search, so large that its time is up first."""
+"""Effort of the search: twenty times the usual, so that it looks on where it has time."""
 BLOCKS = ((1, 10), (11, 20), (21, 40))
 """Groups of drawings, by the number of blocks that the search takes."""
 HEIGHTS = ((0, 3), (3, 5), (5, 7), (7, 9), (5, 9))
@@ -64,8 +65,8 @@ class Answer:
 def parser() -> argparse.ArgumentParser:
     """The options."""
     options = argument_parser(__name__, __doc__)
-    options.add_argument("--weights", default="large", help="sampler: a name, file or run folder; its world counts")
-    options.add_argument("--block_list_weights", default="large-blocklist", help="block-list network of that world")
+    options.add_argument("--weights", required=True, help="sampler: a name, file or run folder; its world counts")
+    options.add_argument("--block_list_weights", default="default", help="block-list network of that world")
     options.add_argument("--drawings", type=int, default=500, help="number of drawings")
     options.add_argument(
         "--smallest", type=float, default=5.0, help="least width or height, whichever is larger [cell]"
@@ -82,11 +83,13 @@ def drawings(world: World, number: int, smallest: float, seed: int) -> list[Mask
     settings = DrawingSettings(smallest=smallest)
     kinds = {kind: weight for kind, weight in settings.kinds.items() if kind != "design"}
     found: list[Mask] = []
-    for i in range(2 * number):
+    for i in itertools.count():
+        if len(found) == number:
+            break
         rng = np.random.default_rng([seed, i])
         kind = choose(kinds, rng)
         drawing = finish(kind, draw(kind, world, settings, rng), world, settings, rng)
-        if drawing is not None and len(found) < number:
+        if drawing is not None:
             found.append(drawing.silhouette)
     return found
 

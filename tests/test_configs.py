@@ -43,7 +43,7 @@ def verbs(path: Path) -> list[str]:
     sections = [verb for verb in VERBS if isinstance(content.get(verb), dict)]
     if sections or WORLDS not in path.parents:
         return sections or [VERB_OF_FOLDER[folder] for folder in (path.parent.name,) if folder in VERB_OF_FOLDER]
-    return ["fit" if "model" in content else "generate"]
+    return ["generate" if path.stem == "generate" else "fit"]
 
 
 def name_of(path: Path) -> str:

@@ -76,7 +76,7 @@ def test_every_config_parses(path: Path, cli: Cli) -> None:
     sections = [verb for verb in VERBS if isinstance(content.get(verb), dict)]
     verbs = {"generate": ["generate"], "model": ["fit"]}.get(path.parent.name, sections)
     if path.parent.parent.name == "worlds":
-        verbs = ["fit" if "model" in content else "generate"]
+        verbs = ["generate" if path.stem == "generate" else "fit"]
     for verb in verbs:
         # What a command line must add to the file; what the file has already may be given twice.
         more = {"fit": ["--data.path", "x"], "generate": ["--out", "x"], "sample": ["a.png", "--out", "x"]}

@@ -53,7 +53,7 @@ def main(
             largest margin against tilting.
         weights: Weights of the sampler: a name (search is one), a .safetensors file, a .ckpt file or a run folder.
         block_list_weights: Weights of the block-list network: a name, a .safetensors file, a .ckpt file or a run
-            folder.
+            folder; those that ship for the sampler's world by default.
         sampler: Settings by which a diffusion model samples; the weights' own where one is null.
         verify: Verified sampling: many stacks are drawn and checked by the simulator (the default after --verify
             alone) or by statics, and the best are kept; where nothing stands, the next likely block list is tried.

@@ -42,7 +42,8 @@ class Method:
     Args:
         weights: Weights of the sampler: a name, a .safetensors file, a .ckpt or a run folder; or class_path and
             init_args of any StackSampler.
-        block_list_weights: Weights of the block-list network: a name, a .safetensors file, a .ckpt or a run folder.
+        block_list_weights: Weights of the block-list network: a name, a .safetensors file, a .ckpt or a run folder;
+            those that ship for the sampler's world by default.
         sampler: Settings of a diffusion model's sampler; what is null is as its weights have it.
         verify: Checker by which verified sampling chooses the best of many stacks; null measures single samples.
         draws: Stacks that verified sampling may draw for a scene.

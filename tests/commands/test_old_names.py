@@ -17,16 +17,12 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from numpy.typing import NDArray
 
 from stackgen.commands.old_names import OLD_NAMES, renew
 from stackgen.data.arrays import StackArrays
 from stackgen.data.dataset import Dataset
-from stackgen.geometry import silhouette
 from stackgen.models.weights import FOLDER
 from stackgen.sampling.methods import load_predictor, load_sampler
-from stackgen.stack import Stack
-from stackgen.world import PAPER_WORLD, Mask, World
 from tests.conftest import Cli
 
 pytestmark = pytest.mark.filterwarnings("ignore")
@@ -99,38 +95,21 @@ def test_an_old_configuration_is_an_argument(cli: Cli, checkpoint: Path, name: s
 
 @pytest.mark.parametrize("name", RUNS)
 def test_an_old_checkpoint_samples_what_it_sampled(validation: StackArrays, name: str) -> None:
-    assert_same(EXPECTED[name], BEFORE / name, *masks_of(validation, [0, 1, 2]), 2)
+    assert_same(EXPECTED[name], BEFORE / name, validation.select(np.arange(3)), 2)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_the_shipped_weights_sample_what_they_sampled(validation: StackArrays, name: str) -> None:
-    world = World.from_json(json.loads((FOLDER / f"{name}.json").read_text()))
-    if world == PAPER_WORLD:
-        masks, counts = masks_of(validation, [2])
-    else:
-        box = Stack(
-            np.zeros(4, np.int64),
-            np.array([[x, 0, z, 0, 0, 0] for z in (0.5, 1.5) for x in (-0.5, 0.5)]),
-            world.catalogue,
-        )
-        masks, counts = silhouette(box, world.grid)[None], box.counts[None]
-    assert_same(EXPECTED[f"shipped {name}"], name, masks, counts, 1)
+    assert_same(EXPECTED[f"shipped {name}"], name, validation.select(np.array([2])), 1)
 
 
-def masks_of(scenes: StackArrays, numbers: list[int]) -> tuple[Mask, NDArray[np.int64]]:
-    """Silhouettes and block lists of some scenes."""
-    chosen = scenes.select(np.array(numbers))
-    return chosen.images(np.arange(len(chosen))), chosen.counts
-
-
-def assert_same(
-    expected: dict[str, Any], weights: str | Path, masks: Mask, counts: NDArray[np.int64], number: int
-) -> None:
+def assert_same(expected: dict[str, Any], weights: str | Path, scenes: StackArrays, number: int) -> None:
+    masks = scenes.images(np.arange(len(scenes)))
     if "predicted" in expected:
         assert load_predictor(weights).predict(masks, top=3).tolist() == expected["predicted"]
         return
     for drawn, poses in zip(
-        load_sampler(weights).sample_batch(masks, counts, number, 5), expected["poses"], strict=True
+        load_sampler(weights).sample_batch(masks, scenes.counts, number, 5), expected["poses"], strict=True
     ):
         for stack, known in zip(drawn, poses, strict=True):
             assert stack.poses == pytest.approx(np.array(known), abs=1e-4)

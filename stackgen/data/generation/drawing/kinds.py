@@ -275,7 +275,7 @@ def _rows(p: Pencil) -> Figure:
         parts += row
         left, right = row[0][:, 0].min(), row[-1][:, 0].max()
         if p.chance(0.4):
-            cut = p.snapped(p.rng.uniform(0, max(0.0, (right - left) / 2)))
+            cut = p.place(0, (right - left) / 2)
             left, right = (left + cut, right) if p.chance(0.5) else (left, right - cut)
         low += height
     return Figure(tuple(parts)) if parts else _block(p)
