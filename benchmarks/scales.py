@@ -1,8 +1,8 @@
 """What search, a sample of the network, verified samples and both give for drawings at the scale that a network knows.
 
 Drawings of every kind of docs/taught.md but designs, tidy and untidy, made for this purpose. `search` is asked for its
-best stack, `one sample` for the first with the network's list, `verified` draws until its time is up, and `both` gives
-half of the time to each, the network drawing with the search's list, and takes the better answer. Every answer is
+best stack, `one sample` for the first with the network's list, `verified` draws until its time is up, and `both` lets
+the network draw with the search's list for as long as the search leaves, and takes the better answer. Every answer is
 simulated; what falls has a front IoU of 0. Seconds are those of one core. Intervals are 95 %, over drawings.
 """
 
@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 SEARCH, ONE, VERIFIED, BOTH = "search", "one sample", "verified", "both"
 EFFORT = 20.0
 """Effort of the search: twenty times the usual, so that it looks on where it has time."""
+LEAST = 0.2
+"""Time without which the network is not asked after a search [s]."""
 BLOCKS = ((1, 10), (11, 20), (21, 40))
 """Groups of drawings, by the number of blocks that the search takes."""
 HEIGHTS = ((0, 3), (3, 5), (5, 7), (7, 9), (5, 9))
@@ -130,8 +132,10 @@ def _both(model: Model, seconds: float, seed: int) -> Method:
 
     def ask(target: Mask) -> Stack:
         began = time.perf_counter()
-        first = _searched(model, seconds / 2, seed)(target)
-        left = max(0.1, seconds - (time.perf_counter() - began))
+        first = _searched(model, seconds, seed)(target)
+        left = seconds - (time.perf_counter() - began)
+        if left < LEAST:
+            return first
         budget = Budget.parse(f"{left}s")
         second = model.sample_verified(_as_it_is(target), 1, seed, blocks=first.counts, budget=budget).stacks[0]
         return max((first, second), key=lambda stack: _fit(model, stack, target)[1])

@@ -14,10 +14,13 @@ from fastapi.testclient import TestClient
 
 from stackgen.commands.cli import main
 from stackgen.commands.sample import COMMAND, with_checker
+from stackgen.io.text import read_json
+from stackgen.models.weights import FOLDER
 from stackgen.studio.requests import CELL, Drawing, Wish
 from stackgen.studio.work.drawings import mask_of, pack, picture_of, reading_of
 from stackgen.studio.work.generating import command_line
 from stackgen.studio.work.methods import BEST, methods
+from stackgen.world import PAPER_WORLD, World
 
 ARCH = np.ones((4 * CELL, 4 * CELL), dtype=bool)
 ARCH[CELL:, CELL:-CELL] = False
@@ -25,6 +28,13 @@ PARSER = COMMAND.parser("yaml")
 DIFFUSION = [method["name"] for method in methods() if method["steps"]]
 SINGLE = [(name, False) for name in DIFFUSION]
 VERIFIED = [(method["name"], True) for method in methods()]
+
+
+def test_the_methods_are_the_samplers_of_the_papers_world() -> None:
+    cards = [read_json(path) for path in FOLDER.glob("*.json")]
+    samplers = {card["name"]: World.from_json(card) for card in cards if card["kind"] != "blocklist"}
+    named = {method["name"] for method in methods()}
+    assert {name for name, world in samplers.items() if world == PAPER_WORLD} == named & set(samplers)
 
 
 @pytest.mark.parametrize(("method", "verified"), VERIFIED + SINGLE)

@@ -5,7 +5,8 @@ the paper's world, and 888,029 of 7 shapes and up to 20 blocks. `ChainHead` is o
 counts one shape after the other. Both are exact: their probabilities add up to one over all lists of
 1 to N blocks, and their best lists are the best of all that an inventory allows.
 
-Legend: B silhouettes, F features, M lists, S shapes, N blocks at most, A the area that is told apart.
+Legend: B silhouettes, F features, M lists, S shapes, N blocks at most, A the area that is told apart,
+P places, K the width of the layer in which features and area meet.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from stackgen.errors import StackgenError
 from stackgen.world import World
@@ -25,6 +27,8 @@ from stackgen.world import World
 MOST_CLASSES = 100_000
 """Largest number of block lists that have a class each."""
 
+_WIDTH = 128  # K, of the layer in which features and area meet
+_GAIN = 3.0  # of that layer, which so learns as fast as the other
 _AT_ONCE = 32  # silhouettes whose best lists are searched together: bounds the memory
 
 
@@ -87,7 +91,8 @@ class ChainHead(nn.Module):
     almost exactly, so that is what the counts of different shapes must agree on. And because so little
     of the past is remembered, the best lists are found exactly, whatever an inventory allows. The largest
     shapes come first: how many small ones there are follows from the area that is left. The layer `common`
-    serves all areas and is learnt first; `special` adds what holds at one area.
+    serves all areas and is learnt first; `read`, `place` and `count` are a layer for each shape in which
+    features and area meet, so that what holds at one area is a good guess at the next.
 
     Args:
         features: Number of features F.
@@ -98,18 +103,21 @@ class ChainHead(nn.Module):
 
     order: Tensor
     back: Tensor
+    waves: Tensor
 
     def __init__(self, features: int, sizes: Sequence[int], max_blocks: int, most: int) -> None:
         super().__init__()
         order = sorted(range(len(sizes)), key=lambda shape: -sizes[shape])
         self.register_buffer("order", torch.tensor(order), persistent=False)
         self.register_buffer("back", torch.argsort(self.order), persistent=False)
+        self.register_buffer("waves", _waves(most), persistent=False)
         self.sizes = tuple(sizes[shape] for shape in order)
         self.max_blocks, self.most = max_blocks, most
+        self.norm = nn.LayerNorm(features)
         self.common = nn.Linear(features, len(sizes) * (max_blocks + 1))
-        self.special = nn.Linear(features, len(sizes) * (most + 1) * (max_blocks + 1))
-        nn.init.zeros_(self.special.weight)
-        nn.init.zeros_(self.special.bias)
+        self.read = nn.Linear(features, len(sizes) * _WIDTH)
+        self.place = nn.Parameter(torch.randn(len(sizes), _WIDTH, _WIDTH) / _WIDTH**0.5)
+        self.count = nn.Parameter(torch.randn(len(sizes), _WIDTH, max_blocks + 1) * 0.02)
 
     @staticmethod
     def of_world(features: int, world: World) -> ChainHead:
@@ -128,9 +136,9 @@ class ChainHead(nn.Module):
         before = counts.cumsum(-1) - counts  # (B, M, S) blocks of the shapes before
         areas = counts * torch.tensor(self.sizes, device=counts.device)
         areas = (areas.cumsum(-1) - areas).clamp(max=self.most)
-        rows = torch.arange(len(features), device=counts.device)[:, None, None]
         shapes = torch.arange(len(self.sizes), device=counts.device)
-        logits = self._possible(self._logits(features)[rows, shapes, areas], before)  # (B, M, S, N + 1)
+        places = self._places()[shapes, areas].transpose(1, 2)  # (B, S, M, K)
+        logits = self._possible(self._logits(features, places).transpose(1, 2), before)  # (B, M, S, N + 1)
         empty = torch.zeros_like(logits, dtype=torch.bool)
         empty[..., -1, 0] = before[..., -1] == 0
         chosen = logits.masked_fill(empty, -torch.inf).log_softmax(-1).gather(-1, counts[..., None])
@@ -175,7 +183,7 @@ class ChainHead(nn.Module):
         number = torch.arange(self.max_blocks + 1, device=features.device)
         blocks, areas = number[:, None, None], torch.arange(self.most + 1, device=features.device)[:, None]
         after = (blocks + number).clamp(max=self.max_blocks)  # (N + 1, 1, N + 1)
-        tables = self._logits(features)
+        tables = self._logits(features, self._places())
         steps: list[Tensor] = []
         rest = [features.new_zeros((len(features), self.max_blocks + 1, self.most + 1))]
         for shape in reversed(range(len(self.sizes))):
@@ -193,16 +201,28 @@ class ChainHead(nn.Module):
             rest.insert(0, (step + rest[0][:, after, filled]).amax(-1))
         return steps, rest
 
-    def _logits(self, features: Tensor) -> Tensor:
-        """Compute the logits of each count of each shape, for each area so far: (B, S, A + 1, N + 1)."""
-        shapes = len(self.sizes)
-        common = self.common(features).unflatten(1, (shapes, 1, -1))
-        return (common + self.special(features).unflatten(1, (shapes, self.most + 1, -1))).float()
+    def _places(self) -> Tensor:
+        """Compute what each area means to each shape: (S, A + 1, K)."""
+        return self.waves @ self.place
+
+    def _logits(self, features: Tensor, places: Tensor) -> Tensor:
+        """Compute the logits (B, S, P, N + 1) of each count of each shape at its places (S, P, K) or (B, S, P, K)."""
+        features = self.norm(features)
+        common = self.common(features).unflatten(1, (len(self.sizes), 1, -1))
+        meeting = F.relu(self.read(features).unflatten(1, (len(self.sizes), 1, -1)) + places)
+        return (common + _GAIN * meeting @ self.count).float()
 
     def _possible(self, logits: Tensor, before: Tensor) -> Tensor:
         """Mask the logits (..., N + 1) of counts that make more than N blocks with those before (...)."""
         number = torch.arange(self.max_blocks + 1, device=logits.device)
         return logits.masked_fill(before[..., None] + number > self.max_blocks, -torch.inf)
+
+
+def _waves(most: int) -> Tensor:
+    """Show each area 0..A as waves (A + 1, K), from hundreds of areas long down to eight."""
+    rates = torch.logspace(-2, math.log10(0.75), _WIDTH // 2)
+    angles = torch.arange(most + 1)[:, None] * rates
+    return 0.5 * torch.cat([angles.sin(), angles.cos()], 1)
 
 
 def _check(counts: Tensor, max_blocks: int) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 from stackgen.baselines import HEURISTICS
 from stackgen.io.text import parse_json
 from stackgen.search.sampler import NAME as SEARCH
+from stackgen.world import PAPER_WORLD, World
 
 BEST = "best"
 """Search and network together, as `stackgen sample` asks them."""
@@ -32,12 +33,12 @@ _TITLES = {
 
 @cache
 def methods() -> tuple[dict[str, Any], ...]:
-    """List the methods: the name, a title, and the number of steps of those that denoise."""
+    """List the methods of the paper's world: the name, a title, and the number of steps of those that denoise."""
     steps: dict[str, int | None] = {}
     for file in files("stackgen").joinpath("assets/weights").iterdir():
         if file.name.endswith(".json"):
             card = parse_json(file.read_text(encoding="utf-8"), file.name)
-            if card["kind"] != "blocklist":
+            if card["kind"] != "blocklist" and World.from_json(card) == PAPER_WORLD:
                 steps[card["name"]] = card["config"].get("schedule", {}).get("steps")
     for name in (SEARCH, *HEURISTICS):
         steps[name] = None
