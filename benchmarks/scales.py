@@ -14,6 +14,7 @@ import multiprocessing
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -35,9 +36,9 @@ if TYPE_CHECKING:
 
 SEARCH, ONE, VERIFIED, BOTH = "search", "one sample", "verified", "both"
 EFFORT = 20.0
-"""Effort of the search: twenty times the usual, so that it looks on where it has time."""
+"""Effort of the search after the usual one, so that it looks on where it has time."""
 LEAST = 0.2
-"""Time without which the network is not asked after a search [s]."""
+"""Time without which nobody is asked after a search [s]."""
 BLOCKS = ((1, 10), (11, 20), (21, 40))
 """Groups of drawings, by the number of blocks that the search takes."""
 HEIGHTS = ((0, 3), (3, 5), (5, 7), (7, 9), (5, 9))
@@ -107,11 +108,22 @@ def _searched(model: Model, seconds: float, seed: int) -> Method:
     from stackgen.sampling.best import best_stacks
     from stackgen.search.problem import SearchSettings
 
-    settings = SearchSettings(seconds=seconds, effort=EFFORT)
+    def once(target: Mask, effort: float, left: float) -> Stack:
+        limits = SearchSettings(seconds=left, effort=effort)
+        found = best_stacks(_as_it_is(target), model.world, model.checker, number=1, settings=limits).chosen[0]
+        return found.verdict.settled if found.verdict.stable else found.stack
 
     def ask(target: Mask) -> Stack:
-        found = best_stacks(_as_it_is(target), model.world, model.checker, number=1, settings=settings)
-        return found.chosen[0].verdict.settled if found.chosen[0].verdict.stable else found.chosen[0].stack
+        began, answers = time.perf_counter(), []
+        for effort in (1.0, EFFORT):  # a search that is cut off may be worse than a short one that ends
+            left = seconds - (time.perf_counter() - began)
+            if answers and left < LEAST:
+                break
+            with suppress(StackgenError):  # it found nothing
+                answers.append(once(target, effort, max(LEAST, left)))
+        if not answers:
+            raise StackgenError("the search found nothing")
+        return max(answers, key=lambda stack: _fit(model, stack, target))
 
     return ask
 
@@ -138,7 +150,7 @@ def _both(model: Model, seconds: float, seed: int) -> Method:
             return first
         budget = Budget.parse(f"{left}s")
         second = model.sample_verified(_as_it_is(target), 1, seed, blocks=first.counts, budget=budget).stacks[0]
-        return max((first, second), key=lambda stack: _fit(model, stack, target)[1])
+        return max((first, second), key=lambda stack: _fit(model, stack, target))
 
     return ask
 

@@ -60,6 +60,8 @@ def best(
     from stackgen.sim.checkers import SimulatorChecker
 
     def proposals(target: Mask, block_list: NDArray[np.int64] | None) -> list[Stack]:
+        if block_list is not None and block_list.sum() > _network().world.max_blocks:
+            return []
         given = inventory if block_list is None else None
         return _network().sample_verified(target, num_samples, seed, block_list, given, budget=_PROPOSED).stacks
 
