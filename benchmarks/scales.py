@@ -114,7 +114,8 @@ def _searched(model: Model, seconds: float, seed: int) -> Method:
         return found.verdict.settled if found.verdict.stable else found.stack
 
     def ask(target: Mask) -> Stack:
-        began, answers = time.perf_counter(), []
+        began = time.perf_counter()
+        answers: list[Stack] = []
         for effort in (1.0, EFFORT):  # a search that is cut off may be worse than a short one that ends
             left = seconds - (time.perf_counter() - began)
             if answers and left < LEAST:
