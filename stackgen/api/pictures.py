@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -59,12 +59,6 @@ def best(
     from stackgen.sampling.best import best_stacks
     from stackgen.sim.checkers import SimulatorChecker
 
-    def proposals(target: Mask, block_list: NDArray[np.int64] | None) -> list[Stack]:
-        if block_list is not None and block_list.sum() > _network().world.max_blocks:
-            return []
-        given = inventory if block_list is None else None
-        return _network().sample_verified(target, num_samples, seed, block_list, given, budget=_PROPOSED).stacks
-
     asked = Model(SearchSampler(), checker=SimulatorChecker())
     Model._check_draw(num_samples, seed)
     if blocks is not None and inventory is not None:
@@ -88,7 +82,7 @@ def best(
         block_list=listed,
         inventory=there,
         settings=search,
-        proposals=proposals,
+        proposals=partial(_proposed, num_samples, seed, inventory),
     )
     on_step()
     physics = asked.checker.physics
@@ -110,6 +104,16 @@ def best(
 
 _PROPOSED = Budget(16)
 """Stacks that the network draws where it is asked."""
+
+
+def _proposed(
+    number: int, seed: int, inventory: Inventory | None, target: Mask, block_list: NDArray[np.int64] | None
+) -> list[Stack]:
+    """Let the network propose stacks for a target (H, W); none of more blocks than it knows."""
+    if block_list is not None and block_list.sum() > _network().world.max_blocks:
+        return []
+    given = inventory if block_list is None else None
+    return _network().sample_verified(target, number, seed, block_list, given, budget=_PROPOSED).stacks
 
 
 @cache

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from stackgen.api import Model, best
-
-SLANT = np.pad(np.tri(40, 120, 0, bool) ^ np.tri(40, 120, -30, bool), 40)  # no stack has an IoU of 0.8 with it
+from tests.sampling.test_best import SLANT
 
 
 def test_the_network_is_not_asked_for_more_blocks_than_it_knows(towers: Model) -> None:

@@ -100,16 +100,19 @@ def test_an_old_configuration_is_an_argument(cli: Cli, checkpoint: Path, name: s
 
 @pytest.mark.parametrize("name", RUNS)
 def test_an_old_checkpoint_samples_what_it_sampled(validation: StackArrays, name: str) -> None:
-    assert_same(EXPECTED[name], BEFORE / name, validation.select(np.arange(3)), 2)
+    assert_same(EXPECTED[name], BEFORE / name, *scenes(validation, [0, 1, 2]), 2)
 
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_the_shipped_weights_sample_what_they_sampled(validation: StackArrays, name: str) -> None:
     world = World.from_json(read_json(FOLDER / f"{name}.json"))
-    if world == PAPER_WORLD:
-        assert_same(EXPECTED[f"shipped {name}"], name, validation.select(np.array([2])), 1)
-    else:
-        assert_same_of(EXPECTED[f"shipped {name}"], name, *box(world), 1)
+    asked = scenes(validation, [2]) if world == PAPER_WORLD else box(world)
+    assert_same(EXPECTED[f"shipped {name}"], name, *asked, 1)
+
+
+def scenes(found: StackArrays, numbers: list[int]) -> tuple[Mask, NDArray[np.int64]]:
+    """The silhouettes (B, H, W) of some stacks, and their counts (B, S)."""
+    return found.images(numbers), found.counts[numbers]
 
 
 def box(world: World) -> tuple[Mask, NDArray[np.int64]]:
@@ -119,11 +122,7 @@ def box(world: World) -> tuple[Mask, NDArray[np.int64]]:
     return silhouette(stack, world.grid)[None], stack.counts[None]
 
 
-def assert_same(expected: dict[str, Any], weights: str | Path, scenes: StackArrays, number: int) -> None:
-    assert_same_of(expected, weights, scenes.images(np.arange(len(scenes))), scenes.counts, number)
-
-
-def assert_same_of(
+def assert_same(
     expected: dict[str, Any], weights: str | Path, masks: Mask, counts: NDArray[np.int64], number: int
 ) -> None:
     if "predicted" in expected:
