@@ -1,8 +1,8 @@
-"""Quality against steps, what verified sampling adds, and what both cost, on validation scenes with their true lists.
+"""Quality against steps, what mending and verified sampling add, and what they cost, on validation scenes.
 
-Two tables: each kind of sampler at some numbers of steps, and verified sampling with both checkers. Intervals are
-95 %, clustered by scene. The time is that of one silhouette's samples alone, warm; verified sampling is timed with its
-checker. Each row is printed and written when it is there.
+Three tables: each kind of sampler at some numbers of steps, samples mended some times, and verified sampling with both
+checkers. Intervals are 95 %, clustered by scene. The time is that of one silhouette's samples alone, warm; verified
+sampling is timed with its checker. Each row is printed and written when it is there.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ KINDS = {
     "dpm": SamplerConfig("dpm"),
     "dpm-sde": SamplerConfig("dpm", eta=1.0),
 }
-TABLES = ("steps", "verified")
+TABLES = ("steps", "mended", "verified")
 METRICS = ("stability", "front_iou", "iou_given_stable", "valid_diversity")
 
 
@@ -54,6 +54,7 @@ def parser() -> argparse.ArgumentParser:
     options = argument_parser(__name__, __doc__)
     options.add_argument("--weights", default="default", help="weights of a diffusion model")
     options.add_argument("--data", default="data/base.npz", help="dataset with a validation split")
+    options.add_argument("--lists", default=None, help="weights that predict the block lists; the true ones by default")
     options.add_argument("--scenes", type=int, default=150, help="drawn from the validation split")
     options.add_argument("--num_samples", type=int, default=3, help="samples of each scene")
     options.add_argument("--seed", type=int, default=0, help="seed of scenes and noise")
@@ -62,6 +63,7 @@ def parser() -> argparse.ArgumentParser:
         "--kinds", nargs="+", choices=list(KINDS), default=["ddpm", "ddim", "dpm"], help="kinds of samplers"
     )
     options.add_argument("--steps", nargs="+", type=int, default=[50, 25, 16, 10, 8, 5, 4], help="calls of the network")
+    options.add_argument("--mends", nargs="+", type=int, default=[0, 1, 2, 4], help="times that a sample is mended")
     options.add_argument("--spacing", type=float, default=None, help="spacing of the steps, see SamplerConfig")
     options.add_argument("--checker", choices=get_args(CheckerName), default="simulator", help="checker that chooses")
     options.add_argument("--draws", type=int, default=64, help="stacks that verified sampling may draw for a scene")
@@ -78,6 +80,8 @@ def rows_of(options: argparse.Namespace) -> list[Row]:
             for steps in options.steps:
                 settings = KINDS[kind].over(SamplerConfig(steps=steps, spacing=options.spacing))
                 rows.append(Row("steps", f"{kind} {steps}", settings))
+    if "mended" in options.tables:
+        rows += [Row("mended", f"mended {times} times", SamplerConfig(mend=times)) for times in options.mends]
     if "verified" in options.tables:
         rows.append(Row("verified", "single samples", fast))
         rows += [Row("verified", checker, fast, checker) for checker in get_args(CheckerName)]
@@ -90,7 +94,7 @@ def main() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")  # as `stackgen sample` has it; torch reads it when it is imported
     rows = rows_of(options)
     from stackgen.evaluation.protocol import load_scenes
-    from stackgen.sampling.methods import load_sampler
+    from stackgen.sampling.methods import load_predictor, load_sampler
     from stackgen.sim.checkers import SimulatorChecker
 
     loaded: Any = load_sampler(options.weights)
@@ -100,10 +104,12 @@ def main() -> None:
     chosen = np.random.default_rng(options.seed).choice(len(scenes), min(options.scenes, len(scenes)), replace=False)
     scenes = [scenes[i] for i in sorted(chosen)]
     checker = SimulatorChecker(until_fall=True)
+    lists = None if options.lists is None else load_predictor(options.lists)
     metrics: dict[str, Any] = {
         "weights": loaded.card.get("name", options.weights),
         "weights_sha256": loaded.card.get("sha256"),
         "dataset": dataset.manifest.name,
+        "lists": options.lists or "the scenes'",
         "scenes": len(scenes),
         "samples_per_scene": options.num_samples,
         "seed": options.seed,
@@ -112,7 +118,7 @@ def main() -> None:
         "rows": [],
     }
     for number, row in enumerate(rows, 1):
-        found = measure(row, loaded.configured(row.sampler), scenes, checker, options)
+        found = measure(row, loaded.configured(row.sampler), scenes, checker, lists, options)
         metrics["rows"].append(found)
         line = ", ".join(f"{name} {percent(found[name])}" for name in METRICS)
         print(f"{number}/{len(rows)} {row.table}: {row.name}: {line}, {found['milliseconds']:.0f} ms", flush=True)
@@ -122,7 +128,9 @@ def main() -> None:
     report("sampling", metrics, tables(metrics["rows"], len(scenes), options.num_samples), options.out)
 
 
-def measure(row: Row, sampler: Any, scenes: Sequence[Any], checker: Any, options: argparse.Namespace) -> dict[str, Any]:
+def measure(
+    row: Row, sampler: Any, scenes: Sequence[Any], checker: Any, lists: Any, options: argparse.Namespace
+) -> dict[str, Any]:
     """Quality and time of a row."""
     from stackgen.evaluation.protocol import Request, evaluate
     from stackgen.sampling.verified import Budget, VerifiedSampler, checker_named
@@ -130,7 +138,7 @@ def measure(row: Row, sampler: Any, scenes: Sequence[Any], checker: Any, options
     if row.verify is not None:
         chooser = checker_named(row.verify, checker)
         sampler = VerifiedSampler(sampler, chooser, Budget(options.draws), row.verify)
-    request = Request(row.name, sampler.world, sampler, num_samples=options.num_samples, seed=options.seed)
+    request = Request(row.name, sampler.world, sampler, lists, num_samples=options.num_samples, seed=options.seed)
     found = evaluate(request, scenes, checker_named(options.checker, checker))
     estimates = {name: found.estimate(name) for name in METRICS}
 

@@ -19,7 +19,7 @@ from stackgen.errors import StackgenError
 from stackgen.models.weights import read_weights
 
 _WORLD = ("kind", "catalogue", "grid", "max_blocks")
-_FREE = ("dropout", "variance", "guidance", "antithetic", "temperature")
+_FREE = ("dropout", "variance", "guidance", "antithetic", "temperature", "mend")
 """What the configurations may differ in: it changes how weights are trained or sampled, not what they mean."""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,12 +11,16 @@ from torch import Tensor
 
 from stackgen.errors import StackgenError
 from stackgen.models.diffusion.denoiser import Denoiser
+from stackgen.models.diffusion.mending import mended, pushed_apart
 from stackgen.models.diffusion.schedules import Schedule, ScheduleConfig
 from stackgen.models.diffusion.settings import SamplerConfig
 from stackgen.models.diffusion.solvers import Predict, ancestral, multistep, standard_normal
 from stackgen.models.poses import POSE, PoseNetwork, raster_order
 from stackgen.models.transformer import TransformerConfig
 from stackgen.world import World
+
+MENDED_FROM = 0.4
+"""Share of T from which a mended stack is denoised anew: its layout is decided there, its places are not."""
 
 Watch = Callable[[Tensor], None]
 """Sees the noisy poses (B, N, 6) [cell, rad] before each step."""
@@ -39,6 +43,7 @@ class DiffusionConfig:
         guidance: Weight of classifier-free guidance while sampling; 1 is none. It needs `drop_silhouette`.
         antithetic: Whether the samples of one silhouette are drawn apart; see SamplerConfig.
         temperature: Factor of the noise that `ddpm` adds where only places are left to decide; see SamplerConfig.
+        mend: Number of times that a stack is mended whose blocks lie in each other; see SamplerConfig.
 
     Raises:
         StackgenError: If a number is out of its range.
@@ -52,6 +57,7 @@ class DiffusionConfig:
     guidance: float = 1.0
     antithetic: bool = False
     temperature: float = 1.0
+    mend: int = 0
 
     def __post_init__(self) -> None:
         if not 0 <= self.drop_silhouette < 1:
@@ -60,6 +66,8 @@ class DiffusionConfig:
             raise StackgenError("diffusion.guidance needs diffusion.drop_silhouette, such as 0.1")
         if not 0 <= self.temperature <= 10:
             raise StackgenError(f"diffusion.temperature must lie in 0..10, got {self.temperature}")
+        if not 0 <= self.mend <= 10:
+            raise StackgenError(f"diffusion.mend must lie in 0..10, got {self.mend}")
 
 
 class PoseDiffusion(PoseNetwork):
@@ -79,6 +87,7 @@ class PoseDiffusion(PoseNetwork):
         self.config = diffusion
         self.schedule = Schedule(schedule)
         self.denoiser = Denoiser(denoiser, world)
+        self.world = world
 
     @property
     def trims(self) -> bool:
@@ -171,25 +180,60 @@ class PoseDiffusion(PoseNetwork):
         sampler: SamplerConfig = SamplerConfig(),  # noqa: B008 - frozen
         watch: Watch | None = None,
     ) -> Tensor:
-        """See PoseNetwork; `sampler` says how to get from noise to poses, and `watch` sees them on the way."""
+        """See PoseNetwork; `sampler` says how noise becomes poses, and `watch` sees it, before anything is mended."""
         config = self.complete(sampler)
-        predict = self._predictor(silhouettes, shapes, mask)
-        if config.guidance is not None and config.guidance != 1:
-            predict = self._guided(predict, self._predictor(torch.zeros_like(silhouettes), shapes, mask), config)
+        predict = self._asked(silhouettes, shapes, mask, config)
         if watch is not None:
             predict = self._watched(predict, watch)
         apart = len(shapes) // len(silhouettes) if config.antithetic else 1
         noise = standard_normal((*shapes.shape, POSE), generator, apart).to(shapes.device)
         assert config.steps and config.spacing
         steps = self.schedule.subset(config.steps, config.spacing)
+        x = self._denoised(predict, noise, steps, config, generator, apart)
+        silhouettes = silhouettes.repeat_interleave(len(shapes) // len(silhouettes), 0) if config.mend else silhouettes
+        for _ in range(config.mend or 0):
+            x = self._mended(x, silhouettes, shapes, mask, steps, config, generator)
+        return x * self.std + self.mean
+
+    def _denoised(
+        self,
+        predict: Predict,
+        noisy: Tensor,
+        steps: Sequence[int],
+        config: SamplerConfig,
+        generator: torch.Generator,
+        apart: int = 1,
+    ) -> Tensor:
+        """Walk down some steps from what is noisy at the first of them."""
         if config.kind == "ddpm":
             posterior = config.variance == "posterior"
             temperature = 1.0 if config.temperature is None else config.temperature
-            x = ancestral(predict, noise, self.schedule, generator, steps, posterior, apart, temperature)
-        else:
-            order, eta = 2 if config.kind == "dpm" else 1, config.eta or 0.0
-            x = multistep(predict, noise, self.schedule, generator, steps, order, eta, apart)
-        return x * self.std + self.mean
+            return ancestral(predict, noisy, self.schedule, generator, steps, posterior, apart, temperature)
+        order, eta = 2 if config.kind == "dpm" else 1, config.eta or 0.0
+        return multistep(predict, noisy, self.schedule, generator, steps, order, eta, apart)
+
+    def _mended(
+        self,
+        x: Tensor,
+        silhouettes: Tensor,
+        shapes: Tensor,
+        mask: Tensor,
+        steps: Sequence[int],
+        config: SamplerConfig,
+        generator: torch.Generator,
+    ) -> Tensor:
+        """Mend the samples (B, N, 6) whose blocks lie in each other: some of these move, then all are denoised anew."""
+        rows, poses = mended(x * self.std + self.mean, shapes, mask, silhouettes, self.world)
+        if not rows:
+            return x
+        clean = (poses - self.mean) / self.std
+        again = [t for t in steps if t <= MENDED_FROM * self.schedule.steps] or steps[-1:]
+        noise = standard_normal(clean.shape, generator, dtype=clean.dtype).to(clean.device)
+        noisy = self.schedule.diffuse(clean, noise, torch.full((len(rows),), again[0], device=clean.device))
+        predict = self._asked(silhouettes[rows], shapes[rows], mask[rows], config)
+        x = x.clone()
+        x[rows] = self._denoised(self._apart(predict, shapes[rows], mask[rows]), noisy, again, config, generator)
+        return x
 
     def complete(self, sampler: SamplerConfig) -> SamplerConfig:
         """Take this model's own settings for what is null in a sampler's.
@@ -199,7 +243,16 @@ class PoseDiffusion(PoseNetwork):
         """
         own = self.config.guidance if self.config.drop_silhouette else None
         config = self.config
-        return sampler.complete(self.schedule.steps, config.variance, own, config.antithetic, config.temperature)
+        return sampler.complete(
+            self.schedule.steps, config.variance, own, config.antithetic, config.temperature, config.mend
+        )
+
+    def _asked(self, silhouettes: Tensor, shapes: Tensor, mask: Tensor, config: SamplerConfig) -> Predict:
+        """Make the function that estimates the clean poses of some scenes, with guidance where there is to be any."""
+        predict = self._predictor(silhouettes, shapes, mask)
+        if config.guidance is None or config.guidance == 1:
+            return predict
+        return self._guided(predict, self._predictor(torch.zeros_like(silhouettes), shapes, mask), config)
 
     def _predictor(self, silhouettes: Tensor, shapes: Tensor, mask: Tensor) -> Predict:
         """Make the function that estimates the clean poses of some scenes; it reads their silhouettes once."""
@@ -210,6 +263,16 @@ class PoseDiffusion(PoseNetwork):
             nonlocal last
             last = self._clean(x, t, self.denoiser(x, t, shapes, mask, memory, last, self._places))
             return last
+
+        return predict
+
+    def _apart(self, own: Predict, shapes: Tensor, mask: Tensor) -> Predict:
+        """Push the estimates of blocks apart where they overlap."""
+        sizes = [[shape.size[0], shape.size[2]] for shape in self.world.catalogue]
+        size = torch.tensor(sizes, dtype=torch.float32, device=mask.device)
+
+        def predict(x: Tensor, t: Tensor) -> Tensor:
+            return (pushed_apart(own(x, t) * self.std + self.mean, shapes, mask, size) - self.mean) / self.std
 
         return predict
 

@@ -34,6 +34,8 @@ class SamplerConfig:
             negatively correlated. Each alone is distributed as before; together they differ more often.
         temperature: Factor of the noise that `ddpm` adds in the lower half of the steps, where layouts are decided and
             only places are left: below 1 blocks lie closer to where the model expects them.
+        mend: Number of times, 0 for never, that a stack is mended whose blocks lie in each other: those go to where the
+            drawing is still empty, and the whole is denoised anew from 40 % of the noise. Nothing is simulated.
 
     Raises:
         StackgenError: If a number is out of its range.
@@ -48,6 +50,7 @@ class SamplerConfig:
     guided: tuple[float, float] | None = None
     antithetic: bool | None = None
     temperature: float | None = None
+    mend: int | None = None
 
     def __post_init__(self) -> None:
         if self.guided is not None:
@@ -60,6 +63,8 @@ class SamplerConfig:
             raise StackgenError(f"sampler.eta must lie in 0..1, got {self.eta}")
         if self.temperature is not None and not 0 <= self.temperature <= 10:
             raise StackgenError(f"sampler.temperature must lie in 0..10, got {self.temperature}")
+        if self.mend is not None and not 0 <= self.mend <= 10:
+            raise StackgenError(f"sampler.mend must lie in 0..10, got {self.mend}")
         if self.guidance is not None and not 0 <= self.guidance <= 100:
             raise StackgenError(f"sampler.guidance must lie in 0..100, got {self.guidance}")
         if self.guided is not None and not 0 <= self.guided[0] < self.guided[1] <= 1:
@@ -83,6 +88,7 @@ class SamplerConfig:
         guidance: float | None = None,
         antithetic: bool = False,
         temperature: float = 1.0,
+        mend: int = 0,
     ) -> SamplerConfig:
         """Fill in all that matters: a model's T and its own settings; `guidance` is null if it has none.
 
@@ -100,7 +106,7 @@ class SamplerConfig:
             raise StackgenError(
                 "sampler.guidance and sampler.guided need a model trained with diffusion.drop_silhouette"
             )
-        defaults = SamplerConfig(kind, steps, SPACING, antithetic=antithetic or None)
+        defaults = SamplerConfig(kind, steps, SPACING, antithetic=antithetic or None, mend=mend or None)
         if kind == "ddpm":
             defaults = replace(defaults, variance=variance, temperature=temperature if temperature != 1 else None)
         else:

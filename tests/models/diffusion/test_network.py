@@ -252,6 +252,8 @@ SETTINGS = [
     SamplerConfig("dpm", 1),
     SamplerConfig(antithetic=True),
     SamplerConfig("dpm", 6, eta=0.5, antithetic=True),
+    SamplerConfig(mend=1),
+    SamplerConfig("ddim", 8, mend=2),
 ]
 
 
@@ -317,6 +319,7 @@ def test_samples_are_drawn_apart_where_model_or_setting_says_so(arrays: StackArr
         ({"kind": "dpm", "eta": 1.5}, "0..1"),
         ({"kind": "dpm", "temperature": 0.5}, "temperature is not for dpm; set eta"),
         ({"temperature": -0.1}, "0..10"),
+        ({"mend": -1}, "mend must lie in 0..10"),
         ({"spacing": 0.5}, "1..10"),
         ({"guidance": 2.0}, "sampler.guidance"),
         ({"guidance": -1.0}, "must lie in"),
