@@ -20,7 +20,7 @@ from stackgen.evaluation.tables import HEADINGS, PAPER_COLUMNS
 
 FORMAT = "stackgen.report/2"
 SECTIONS = {
-    "one-shot": "Single samples, as they come",
+    "one-shot": "Single samples, neither simulated nor chosen",
     "verified": "Verified sampling: the best of several samples, chosen by a checker",
 }
 HIDDEN = ("iou_given_stable", "side_iou", "top_iou", "front_iou_before_physics", "valid_diversity")
