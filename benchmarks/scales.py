@@ -43,6 +43,8 @@ BLOCKS = ((1, 10), (11, 20), (21, 40))
 """Groups of drawings, by the number of blocks that the search takes."""
 HEIGHTS = ((0, 3), (3, 5), (5, 7), (7, 9), (5, 9))
 """Groups of drawings, by their height [cell]: above the first number, up to the second."""
+FAIR = 0.7
+"""Front IoU of the search's answer below which blocks hardly make a drawing; such drawings are counted apart."""
 
 Method = Callable[[Mask], "Stack"]
 """Function that answers a silhouette with the stack that it thinks best, as it stands in the end."""
@@ -200,11 +202,13 @@ def share(options: argparse.Namespace, name: str, number: int) -> list[Answer]:
     return ask_all(METHODS[name](model, options.seconds, options.seed), model, targets[number :: options.workers])
 
 
-def groups_of(targets: Sequence[Mask], blocks: Sequence[int], world: World) -> dict[str, list[int]]:
-    """Sort drawings by the number of their blocks and by their height [cell]; one may lie in several groups."""
+def groups_of(targets: Sequence[Mask], searched: Sequence[Answer], world: World) -> dict[str, list[int]]:
+    """Sort drawings by what the search answered, and by their height [cell]; one may lie in several groups."""
     groups: dict[str, list[int]] = {"all": list(range(len(targets)))}
     for low, high in BLOCKS:
-        groups[f"{low} to {high} blocks"] = [i for i, number in enumerate(blocks) if low <= number <= high]
+        groups[f"{low} to {high} blocks"] = [i for i, one in enumerate(searched) if low <= one.blocks <= high]
+    groups[f"fitted by {FAIR:g} or more"] = [i for i, one in enumerate(searched) if one.front_iou >= FAIR]
+    groups[f"fitted by less than {FAIR:g}"] = [i for i, one in enumerate(searched) if one.front_iou < FAIR]
     tall = [np.count_nonzero(target.any(axis=1)) / world.grid.pixels_per_cell for target in targets]
     for low, high in HEIGHTS:
         groups[f"{low} to {high} cells high"] = [i for i, cells in enumerate(tall) if low < cells <= high]
@@ -244,7 +248,7 @@ def main() -> None:
             total = row_of(found[name])
             shown = percent(total["stability"]), percent(total["front_iou"]), f"{total['seconds']:.2f} s"
             print(name, *shown, flush=True)
-    groups = groups_of(targets, [answer.blocks for answer in found[SEARCH]], model.world)
+    groups = groups_of(targets, found[SEARCH], model.world)
     rows = [
         {"drawings": group, "number": len(members), "method": name} | row_of([answers[i] for i in members])
         for group, members in groups.items()
