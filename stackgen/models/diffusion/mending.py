@@ -9,7 +9,6 @@ Legend: B stacks, N blocks at most, S shapes, H x W pixels.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -70,6 +69,8 @@ def relocated(stack: Stack, drawing: Mask, grid: Grid) -> Stack | None:
 
 def _emptiest(block: Stack, empty: Mask, grid: Grid) -> tuple[np.ndarray, Mask]:
     """Find the pose (6,) of a block that fills most of what is empty (H, W), the lowest of equals; and its picture."""
+    import cv2
+
     level = np.array([0, 0, block.catalogue[int(block.shapes[0])].size[2] / 2, 0, 0, 0])
     picture = silhouette(block.with_poses([level]), grid)
     (rows, columns) = (np.flatnonzero(picture.any(axis=axis)) for axis in (1, 0))
