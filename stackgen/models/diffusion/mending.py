@@ -20,7 +20,8 @@ from stackgen.stack import Stack
 from stackgen.world import Grid, Mask, World
 
 CONFLICT = 0.15
-"""Overlap from which on two blocks cannot both be where they are [cell]; the simulator pushes lesser ones apart."""
+"""Overlap above which one of two blocks is moved [cell]. Lesser ones the simulator pushes apart; this is below
+`stackgen.sim.statics.fit.IMPOSSIBLE`, from where on no structure can be: two of three samples above this fall."""
 _TOUCH, _STRENGTH, _ROUNDS = 0.05, 0.3, 3
 
 
