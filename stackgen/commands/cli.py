@@ -51,7 +51,7 @@ VERBS: dict[str, Verb] = {
     "test": Verb("stackgen.commands.test", "measure weights or a sampler by the paper's protocol"),
     "predict": Verb("stackgen.commands.predict", "sample stacks for the scenes of a dataset"),
     "sweep": Verb("stackgen.commands.sweep", "try many settings of a training, locally or at W&B"),
-    "prefer": Verb("stackgen.commands.prefer", "collect what verdicts teach a sampler or a block-list network"),
+    "prefer": Verb("stackgen.commands.prefer", "pair failures of a model with stacks that stand, to fine-tune it"),
     "report": Verb("stackgen.commands.report", "make the paper's table with every row, and its plots"),
     "export": Verb("stackgen.commands.export", "turn a training checkpoint into weights with a card"),
     "mix": Verb("stackgen.commands.mix", "add up weights of one architecture, each with its share"),

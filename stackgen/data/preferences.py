@@ -1,10 +1,9 @@
-"""What verdicts teach: pairs of stacks for a sampler, and what block lists came to for the network of these.
+"""Pairs of stacks for one silhouette and block list, one better than the other: what verdicts teach.
 
 A sampler's own failures say what its training data cannot: which stacks it is tempted by and must leave.
-Each is paired with a stack that stands and matches. And of the lists that a block-list network thinks likely, some give
-the sampler more to stand on than others, which no dataset says either.
+Each is paired with a stack that stands and matches.
 
-Legend: P pairs, N blocks at most, n samples a scene, D scenes, M lists, S shapes.
+Legend: P pairs, N blocks at most, n samples a scene.
 """
 
 from __future__ import annotations
@@ -16,16 +15,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stackgen.data.arrays import FIELDS, PADDING, StackArrays
+from stackgen.data.arrays import PADDING, StackArrays
 from stackgen.data.compact import write_npz
 from stackgen.errors import MALFORMED, StackgenError
 from stackgen.geometry import silhouette_iou
 from stackgen.io.arrays import read_npz
 from stackgen.io.files import read_bytes
-from stackgen.protocols import BlockListPredictor, StabilityChecker, StackSampler
+from stackgen.protocols import StabilityChecker, StackSampler
 
 _SCENES_AT_ONCE = 128
-_TRIED_AT_ONCE = 16
 
 
 @dataclass(frozen=True)
@@ -144,116 +142,6 @@ def prefer(
         for poses in (better, worse)
     ]
     return Preferences(*pair)
-
-
-@dataclass(frozen=True)
-class TriedLists:
-    """What a sampler made of M block lists for each of D silhouettes.
-
-    Args:
-        scenes: The D stacks of a dataset that the silhouettes are of.
-        lists: (D, M, S) block lists, no two of a scene alike.
-        worth: (D, M) mean front IoU of the stacks that were sampled with each list, those that fell counting as 0.
-
-    Raises:
-        StackgenError: If they do not belong together.
-    """
-
-    scenes: StackArrays
-    lists: NDArray[np.int64]
-    worth: NDArray[np.float32]
-
-    def __post_init__(self) -> None:
-        d, shapes = len(self.scenes), self.scenes.num_shapes
-        fit = self.lists.ndim == 3 and self.lists.shape[::2] == (d, shapes) and self.worth.shape == self.lists.shape[:2]
-        if not fit or d == 0 or self.lists.shape[1] < 2 or self.lists.dtype.kind not in "iu":
-            raise StackgenError("tried lists: there must be scenes, each with two block lists or more")
-        if self.lists.min() < 0 or not np.isfinite(self.worth).all():
-            raise StackgenError("tried lists: counts must be at least 0, and what lists are worth finite numbers")
-
-    def __len__(self) -> int:
-        return len(self.scenes)
-
-    def save(self, path: Path) -> None:
-        """Write as `.npz`, whole or not at all.
-
-        Raises:
-            StackgenError: If it cannot be written.
-        """
-        if path.suffix != ".npz":
-            raise StackgenError(f"tried lists are written to a .npz file, not {path.name}")
-        fields = {name: getattr(self.scenes, name) for name in (*FIELDS, "num_shapes")}
-        write_npz(path, {**fields, "lists": self.lists, "worth": self.worth})
-
-    @staticmethod
-    def load(path: str | Path) -> TriedLists:
-        """Read what :meth:`save` wrote.
-
-        Raises:
-            StackgenError: If the file is missing, broken, or not such a file.
-        """
-        hint = "`stackgen prefer --lists 8`"
-        try:
-            file = read_npz(read_bytes(path))
-            scenes = StackArrays(**{name: file[name] for name in FIELDS}, num_shapes=int(file["num_shapes"]))
-            return TriedLists(scenes, file["lists"], file["worth"])
-        except FileNotFoundError as error:
-            raise StackgenError(f"no tried lists at {path}: make them with {hint}") from error
-        except (OSError, *MALFORMED) as error:
-            raise StackgenError(f"{path} is not a file of tried lists: make one with {hint}") from error
-
-
-def try_lists(
-    sampler: StackSampler,
-    predictor: BlockListPredictor,
-    checker: StabilityChecker,
-    stacks: StackArrays,
-    *,
-    number: int = 8,
-    num_samples: int = 3,
-    seed: int = 0,
-    progress: Callable[[int], None] = lambda scenes: None,
-) -> TriedLists:
-    """Sample with a network's likeliest block lists for the silhouettes of some stacks, and with the stacks' own.
-
-    Args:
-        sampler: The sampler that the lists are for.
-        predictor: The block-list network that is to learn.
-        checker: Says which samples stand.
-        stacks: Stacks of the training split, of the sampler's world.
-        number: Likeliest lists of each scene; its own is one more, or the next likely one where it is among them.
-        num_samples: Samples with each list, n.
-        seed: The same seed gives the same stacks.
-        progress: Called with the number of scenes done.
-
-    Raises:
-        StackgenError: If the world has fewer lists.
-    """
-    order = np.argsort(stacks.lengths, kind="stable")  # about equal numbers of blocks together: little padding
-    lists: list[NDArray[np.int64]] = []
-    worth: list[NDArray[np.float32]] = []
-    for start in range(0, len(order), _TRIED_AT_ONCE):
-        part = order[start : start + _TRIED_AT_ONCE]
-        targets, own = stacks.images(part), stacks.counts[part]
-        likely = predictor.predict(targets, top=number + 1)
-        if likely.shape[1] <= number:
-            raise StackgenError(f"prefer: there are {likely.shape[1]} block lists, too few to try {number + 1}")
-        known = (likely[:, :number] == own[:, None]).all(-1).any(-1, keepdims=True)
-        tried = np.concatenate([likely[:, :number], np.where(known, likely[:, -1], own)[:, None]], axis=1)
-        scene = np.repeat(np.arange(len(part)), number + 1)
-        samples = sampler.sample_batch(
-            targets[scene], tried.reshape(len(scene), -1), num_samples, seed * 1_000_003 + start
-        )
-        verdicts = checker.check_all([stack for drawn in samples for stack in drawn])
-        grid = sampler.world.grid
-        fits = [
-            silhouette_iou(verdict.settled, targets[i], grid) if verdict.stable else 0.0
-            for i, verdict in zip(np.repeat(scene, num_samples), verdicts, strict=True)
-        ]
-        lists.append(tried)
-        worth.append(np.array(fits, np.float32).reshape(*tried.shape[:2], num_samples).mean(axis=2))
-        progress(min(start + _TRIED_AT_ONCE, len(order)))
-    return TriedLists(stacks.select(order), np.concatenate(lists), np.concatenate(worth))
 
 
 def _truth(stacks: StackArrays, row: int) -> NDArray[np.float64]:

@@ -8,17 +8,15 @@ import lazy_loader
 
 if TYPE_CHECKING:
     from stackgen.models.block_list.module import BlockListCNN
-    from stackgen.models.block_list.tuning import ListTuning
     from stackgen.models.diffusion.module import DDPM
     from stackgen.models.diffusion.preference import VerdictTuning
 
-__all__ = ["DDPM", "BlockListCNN", "ListTuning", "VerdictTuning"]
+__all__ = ["DDPM", "BlockListCNN", "VerdictTuning"]
 
 __getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "block_list.module": ["BlockListCNN"],
-        "block_list.tuning": ["ListTuning"],
         "diffusion.module": ["DDPM"],
         "diffusion.preference": ["VerdictTuning"],
     },
